@@ -1,0 +1,148 @@
+//! Files that are either whole or absent: written beside their final place, flushed to disk, then renamed.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+use tempfile::NamedTempFile;
+
+/// A file could not be read or written.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: cannot {action}: {source}", path.display())]
+pub struct FileError {
+    /// The file in question (its final name, not the temporary one).
+    pub path: PathBuf,
+    /// What was being done.
+    pub action: &'static str,
+    /// The system's own message.
+    pub source: io::Error,
+}
+
+impl FileError {
+    /// An error while doing `action` to `path`.
+    pub fn new(path: &Path, action: &'static str, source: io::Error) -> Self {
+        Self { path: path.to_owned(), action, source }
+    }
+}
+
+/// A file in the making. Write to [`AtomicFile::path`] or [`AtomicFile::file`]; [`AtomicFile::commit`] gives it its
+/// name. Dropped without a commit, it leaves nothing behind.
+pub struct AtomicFile {
+    target: PathBuf,
+    temporary: NamedTempFile,
+}
+
+impl AtomicFile {
+    /// Starts `target`, in its own directory (created if missing), so that the final rename cannot cross devices.
+    pub fn create(target: &Path) -> Result<Self, FileError> {
+        let directory = parent(target);
+        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        let temporary = tempfile::Builder::new()
+            .prefix(".tce-")
+            .suffix(".part")
+            .tempfile_in(directory)
+            .map_err(|e| FileError::new(target, "create a temporary file beside it", e))?;
+        Ok(Self { target: target.to_owned(), temporary })
+    }
+
+    /// Where the bytes go until the commit.
+    pub fn path(&self) -> &Path {
+        self.temporary.path()
+    }
+
+    /// The open temporary file.
+    pub fn file(&mut self) -> &mut File {
+        self.temporary.as_file_mut()
+    }
+
+    /// Flushes the bytes to disk, gives the file its final name and flushes the directory.
+    pub fn commit(self) -> Result<(), FileError> {
+        let Self { target, temporary } = self;
+        // The content may have been written through another handle (an HDF5 writer opens the path itself), so the
+        // file is synced by path.
+        File::open(temporary.path())
+            .and_then(|f| f.sync_all())
+            .map_err(|e| FileError::new(&target, "flush to disk", e))?;
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            // A temporary file is private to its owner; a result is not.
+            fs::set_permissions(temporary.path(), fs::Permissions::from_mode(0o644))
+                .map_err(|e| FileError::new(&target, "set the permissions", e))?;
+        }
+        temporary.persist(&target).map_err(|e| FileError::new(&target, "rename into place", e.error))?;
+        #[cfg(unix)]
+        File::open(parent(&target))
+            .and_then(|d| d.sync_all())
+            .map_err(|e| FileError::new(&target, "flush the directory of", e))?;
+        Ok(())
+    }
+}
+
+fn parent(path: &Path) -> &Path {
+    match path.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p,
+        _ => Path::new("."),
+    }
+}
+
+/// Writes `bytes` to `path`, whole or not at all.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+    let mut file = AtomicFile::create(path)?;
+    file.file().write_all(bytes).map_err(|e| FileError::new(path, "write", e))?;
+    file.commit()
+}
+
+/// Writes `value` as indented JSON to `path`, whole or not at all.
+pub fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), FileError> {
+    let mut bytes = serde_json::to_vec_pretty(value).map_err(|e| FileError::new(path, "serialise", e.into()))?;
+    bytes.push(b'\n');
+    write_atomically(path, &bytes)
+}
+
+/// The SHA-256 of `bytes` as lower-case hexadecimal.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// The SHA-256 of a file, read in pieces.
+pub fn sha256_file(path: &Path) -> Result<String, FileError> {
+    let mut file = File::open(path).map_err(|e| FileError::new(path, "open", e))?;
+    let mut hash = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer).map_err(|e| FileError::new(path, "read", e))? {
+            0 => break,
+            n => hash.update(&buffer[..n]),
+        }
+    }
+    Ok(hash.finalize().iter().map(|b| format!("{b:02x}")).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_uncommitted_file_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("deep/result.json");
+        let mut file = AtomicFile::create(&target).unwrap();
+        file.file().write_all(b"half").unwrap();
+        drop(file);
+        assert_eq!(fs::read_dir(target.parent().unwrap()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_committed_file_replaces_the_old_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("result");
+        write_atomically(&target, b"old").unwrap();
+        write_atomically(&target, b"new").unwrap();
+        assert_eq!(fs::read(&target).unwrap(), b"new");
+        assert_eq!(sha256_file(&target).unwrap(), sha256_hex(b"new"));
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+}

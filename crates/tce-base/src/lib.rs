@@ -1,0 +1,10 @@
+//! What every crate of the workspace stands on: named random streams, files that are never half-written, and long
+//! work that shows its progress and can be interrupted.
+
+pub mod files;
+pub mod progress;
+pub mod random;
+
+pub use files::{AtomicFile, FileError, sha256_file, sha256_hex, write_atomically, write_json};
+pub use progress::{Progress, interrupted, listen_for_interrupts};
+pub use random::{Rng, Streams};

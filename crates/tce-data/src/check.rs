@@ -1,0 +1,215 @@
+//! Checks of a data set that need no simulator.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::hash::{DefaultHasher, Hasher};
+
+use serde::Serialize;
+
+use crate::agents::{ANT_ZEROS, describe, infer_agents};
+use crate::moments::Moments;
+use crate::{Agent, Rows, Transitions};
+
+/// Actions may leave the box [-1, 1] by this much: float32 rounding of a tanh.
+pub(crate) const ACTION_TOLERANCE: f32 = 1e-4;
+
+/// How bad a finding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// Worth knowing.
+    Note,
+    /// Probably not what was meant.
+    Warning,
+    /// The data cannot be used for this agent.
+    Error,
+}
+
+/// One thing that was noticed.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Finding {
+    /// How bad it is.
+    pub severity: Severity,
+    /// Which column.
+    pub field: &'static str,
+    /// What was found, what was expected, what to do.
+    pub message: String,
+}
+
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let severity = match self.severity {
+            Severity::Note => "note",
+            Severity::Warning => "warning",
+            Severity::Error => "error",
+        };
+        write!(f, "{severity}: {}: {}", self.field, self.message)
+    }
+}
+
+/// The result of [`check()`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Check {
+    /// Everything noticed, in the order of the columns.
+    pub findings: Vec<Finding>,
+    /// Share of rows whose (s, a, s') an earlier row already has, 0..1.
+    pub duplicate_share: f64,
+}
+
+impl Check {
+    /// Whether there is no error.
+    pub fn is_ok(&self) -> bool {
+        self.findings.iter().all(|f| f.severity != Severity::Error)
+    }
+}
+
+/// Checks `data`, expected to be of `agent` (`None`: anybody's own robot).
+pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
+    let mut findings = Vec::new();
+    let mut add = |severity, field, message: String| findings.push(Finding { severity, field, message });
+    if data.is_empty() {
+        add(Severity::Error, "rows", "the data set has no rows; expected at least one".into());
+        return Check { findings, duplicate_share: 0.0 };
+    }
+    if let Some(agent) = agent {
+        let (o, a) = agent.dims();
+        let fits = (o, a) == (data.obs_dim, data.act_dim)
+            && (agent == Agent::Ant || infer_agents(data).contains(&agent));
+        if !fits {
+            let found = describe(data);
+            add(
+                Severity::Error,
+                "observations",
+                format!("these are data of another agent: {found}; expected {agent} ({o} observations, {a} actions)"),
+            );
+        }
+    }
+    for (field, values, dim) in [
+        ("observations", &data.observations, data.obs_dim),
+        ("actions", &data.actions, data.act_dim),
+        ("rewards", &data.rewards, 1),
+        ("next_observations", &data.next_observations, data.obs_dim),
+    ] {
+        if let Some(at) = values.iter().position(|x| !x.is_finite()) {
+            let bad = values.iter().filter(|x| !x.is_finite()).count();
+            add(
+                Severity::Error,
+                field,
+                format!("{bad} values are NaN or infinite, the first at row {}, column {}", at / dim, at % dim),
+            );
+        }
+    }
+    if let Some((severity, message)) = dead_dimensions(data, agent) {
+        add(severity, "observations", message);
+    }
+    if let Some(message) = actions_outside(&data.actions, data.act_dim) {
+        add(Severity::Warning, "actions", message);
+    }
+    let duplicate_share = duplicate_share(data);
+    if duplicate_share > 0.01 {
+        let percent = 100.0 * duplicate_share;
+        add(Severity::Warning, "rows", format!("{percent:.1} % of the rows repeat an earlier (s, a, s') exactly"));
+    }
+    Check { findings, duplicate_share }
+}
+
+/// Compares the dimensions without any spread with those the agent is known to have.
+fn dead_dimensions(data: &Transitions, agent: Option<Agent>) -> Option<(Severity, String)> {
+    let m = Moments::of(&[Rows::new(&data.observations, data.obs_dim)]);
+    let dead: Vec<usize> = (0..data.obs_dim).filter(|&d| m.std[d] == 0.0).collect();
+    let expected: Vec<usize> = match agent {
+        Some(Agent::Ant) if data.obs_dim == 111 => (111 - ANT_ZEROS..111).collect(),
+        _ => Vec::new(),
+    };
+    // A single row has no spread anywhere.
+    if dead == expected || data.len() < 2 {
+        return None;
+    }
+    let missing: Vec<_> = expected.iter().filter(|d| !dead.contains(d)).collect();
+    let extra: Vec<_> = dead.iter().filter(|d| !expected.contains(d)).collect();
+    if !missing.is_empty() {
+        let message = format!(
+            "dimensions {missing:?} vary; expected zeros there (Ant's contact forces, which the benchmark's simulator \
+             leaves at 0). These data come from another simulator version and do not match the simulated target"
+        );
+        return Some((Severity::Warning, message));
+    }
+    let message = format!("dimensions {extra:?} never change; standardising leaves them alone");
+    Some((if agent.is_some() { Severity::Warning } else { Severity::Note }, message))
+}
+
+/// In words: which actions leave the box [-1, 1] by more than float32 rounding. `None` if none does.
+pub(crate) fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
+    let outside = |x: &&f32| x.abs() > 1.0 + ACTION_TOLERANCE;
+    let count = actions.iter().filter(outside).count();
+    let at = actions.iter().position(|x| outside(&x))?;
+    let worst = actions.iter().fold(0f32, |m, x| m.max(x.abs()));
+    Some(format!(
+        "{count} values lie outside of [-1, 1] (largest magnitude {worst}, first at row {}, column {}); the simulator \
+         clamps them, a policy with a tanh cannot reach them: clip them or rescale the actions",
+        at / dim,
+        at % dim
+    ))
+}
+
+fn duplicate_share(data: &Transitions) -> f64 {
+    let rows = Rows::transitions(data);
+    let mut row = vec![0f32; rows.dim()];
+    let mut seen = HashSet::with_capacity(rows.len());
+    // 64 bits: among two million different rows, a false match has probability 1e-7.
+    let repeated = (0..rows.len())
+        .filter(|&i| {
+            rows.copy_row(i, &mut row);
+            let mut hash = DefaultHasher::new();
+            row.iter().for_each(|x| hash.write_u32(x.to_bits()));
+            !seen.insert(hash.finish())
+        })
+        .count();
+    repeated as f64 / rows.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::agents::tests::looks_like;
+
+    fn errors(c: &Check) -> Vec<String> {
+        c.findings.iter().filter(|f| f.severity == Severity::Error).map(Finding::to_string).collect()
+    }
+
+    #[test]
+    fn good_data_of_every_agent_pass_and_of_another_do_not() {
+        for a in Agent::ALL {
+            for b in Agent::ALL {
+                let c = check(&looks_like(a), Some(b));
+                assert_eq!(c.is_ok(), a == b, "{a} as {b}: {:?}", c.findings);
+                if a != b {
+                    let e = &errors(&c)[0];
+                    assert!(e.contains(a.name()) && e.contains(b.name()), "{e}");
+                }
+            }
+            assert_eq!(check(&looks_like(Agent::Ant), Some(Agent::Ant)).findings, []);
+        }
+    }
+
+    #[test]
+    fn each_defect_is_found() {
+        let found = |change: &dyn Fn(&mut Transitions), agent| {
+            let mut t = looks_like(agent);
+            change(&mut t);
+            let c = check(&t, Some(agent));
+            c.findings.iter().map(Finding::to_string).collect::<Vec<_>>().join("\n")
+        };
+        let text = found(&|t| t.rewards[3] = f32::NAN, Agent::Hopper);
+        assert!(text.contains("error: rewards") && text.contains("row 3, column 0"), "{text}");
+        let text = found(&|t| t.actions[4] = 1.5, Agent::Hopper);
+        assert!(text.contains("warning: actions") && text.contains("row 1, column 1"), "{text}");
+        let text = found(&|t| t.observations[50] = 0.25, Agent::Ant);
+        assert!(text.contains("dimensions [50] vary"), "{text}");
+        let text = found(&|t| t.observations.iter_mut().skip(4).step_by(11).for_each(|x| *x = 0.5), Agent::Hopper);
+        assert!(text.contains("dimensions [4] never change"), "{text}");
+        let text = found(&|t| t.extend(&t.clone()), Agent::Hopper);
+        assert!(text.contains("50.0 % of the rows repeat"), "{text}");
+        assert!(!check(&Transitions::new(11, 3), None).is_ok());
+    }
+}

@@ -1,0 +1,48 @@
+//! Z-score filtering of generated rows (Eq. 8).
+
+use crate::Rows;
+use crate::moments::Moments;
+
+/// Which rows satisfy |x_d - μ_d| <= z_th σ_d in every dimension d, with μ and σ (population) of `rows` themselves.
+///
+/// Dimensions of zero spread say nothing and are skipped. A row with NaN or infinity is never kept.
+pub fn zscore_keep(rows: &Rows<'_>, z_th: f64) -> Vec<bool> {
+    let m = Moments::of(std::slice::from_ref(rows));
+    let mut row = vec![0.0f32; rows.dim()];
+    (0..rows.len())
+        .map(|i| {
+            rows.copy_row(i, &mut row);
+            row.iter().enumerate().all(|(d, &x)| {
+                x.is_finite() && (m.std[d] == 0.0 || (x as f64 - m.mean[d]).abs() <= z_th * m.std[d])
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_goes_when_any_dimension_is_out_and_dead_dimensions_do_not_count() {
+        // 99 rows at ±1 and one at 50 in the second column; the third is constant.
+        let mut data: Vec<f32> = (0..99).flat_map(|i| [(i % 3) as f32, if i % 2 == 0 { 1.0 } else { -1.0 }, 0.1]).collect();
+        data.extend([1.0, 50.0, 0.1]);
+        let keep = zscore_keep(&Rows::new(&data, 3), 3.0);
+        assert_eq!(keep.iter().filter(|&&k| !k).count(), 1);
+        assert!(!keep[99]);
+    }
+
+    /// Two points ±1 have σ = 1: the bound is inclusive.
+    #[test]
+    fn the_threshold_is_inclusive() {
+        let data = [1.0, -1.0];
+        assert_eq!(zscore_keep(&Rows::new(&data, 1), 1.0), [true, true]);
+        assert_eq!(zscore_keep(&Rows::new(&data, 1), 0.999), [false, false]);
+    }
+
+    #[test]
+    fn nan_is_never_kept() {
+        assert_eq!(zscore_keep(&Rows::new(&[1.0, f32::NAN, 1.0], 1), 3.0), [true, false, true]);
+    }
+}

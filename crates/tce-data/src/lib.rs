@@ -1,0 +1,43 @@
+//! Transitions: what they are, how they come from files and go back, how they are compared and selected.
+//!
+//! | question | answer |
+//! |---|---|
+//! | What is a data set? | [`Transitions`]: columns s, a, r, s', terminal, time-out; [`Rows`] views them as points |
+//! | Where does it come from? | [`load`]: HDF5 in OTDF's or D4RL's layout, validated before use, with a [`LoadReport`] |
+//! | Where does it go? | [`save_d4rl`]: D4RL's layout with `next_observations`, atomically |
+//! | What is in it? | [`inspect`], [`check`](check()), [`infer_agents`], [`ensure_same_agent`] |
+//! | In which units does a network see it? | [`Standardizer`] |
+//! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
+//! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
+//! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF) |
+//!
+//! Everything here is deterministic: the same bytes at any number of threads.
+
+mod agents;
+mod check;
+mod error;
+pub mod files;
+mod filter;
+mod inspect;
+mod moments;
+mod neighbours;
+mod quality;
+mod reference;
+mod rows;
+mod standardise;
+mod transitions;
+mod transport;
+
+pub use agents::{AgentMismatch, ensure_same_agent, infer_agents};
+pub use check::{Check, Finding, Severity, check};
+pub use error::{DataError, Problem};
+pub use files::{Dropped, Layout, LoadOptions, LoadReport, Loaded, Successors, load, read_attributes, save_d4rl};
+pub use filter::zscore_keep;
+pub use inspect::{DimensionSummary, Inspection, Summary, inspect};
+pub use neighbours::{NeighbourOptions, Units, lambda_quantile_select, nn_distances};
+pub use quality::Quality;
+pub use reference::{ReferenceScores, ScoreTable, Shift, reference_scores};
+pub use rows::Rows;
+pub use standardise::{RELATIVE_FLOOR, Standardizer};
+pub use transitions::{Agent, Episode, Transitions};
+pub use transport::{TransportOptions, transport_costs};
