@@ -32,8 +32,7 @@ pub fn infer_agents(data: &Transitions) -> Vec<Agent> {
         }
         (17, 6) => {
             let walks = |row: &&[f32]| row[0] > 0.8 && row[0] < 2.0 && row[8..].iter().all(|v| v.abs() <= 10.001);
-            let share =
-                data.observations.chunks_exact(17).filter(walks).count() as f64 / data.len().max(1) as f64;
+            let share = data.observations.chunks_exact(17).filter(walks).count() as f64 / data.len().max(1) as f64;
             match share {
                 _ if data.is_empty() => vec![Agent::HalfCheetah, Agent::Walker2d],
                 s if s >= 0.999 => vec![Agent::Walker2d],

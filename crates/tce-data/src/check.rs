@@ -73,8 +73,8 @@ pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
     }
     if let Some(agent) = agent {
         let (o, a) = agent.dims();
-        let fits = (o, a) == (data.obs_dim, data.act_dim)
-            && (agent == Agent::Ant || infer_agents(data).contains(&agent));
+        let fits =
+            (o, a) == (data.obs_dim, data.act_dim) && (agent == Agent::Ant || infer_agents(data).contains(&agent));
         if !fits {
             let found = describe(data);
             add(

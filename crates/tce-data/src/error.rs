@@ -44,13 +44,13 @@ pub enum DataError {
         /// The file.
         file: PathBuf,
         /// The HDF5 data set, or `file` for the file as a whole.
-        field: String,
+        field: Box<str>,
         /// What is there.
         found: String,
         /// What should be there.
         expected: String,
         /// What the user can do.
-        advice: String,
+        advice: Box<str>,
     },
     /// The operating system refused.
     #[error(transparent)]
@@ -72,10 +72,10 @@ impl DataError {
         Self::Invalid {
             problem,
             file: file.to_owned(),
-            field: field.to_owned(),
+            field: field.into(),
             found: found.into(),
             expected: expected.into(),
-            advice: advice.into(),
+            advice: advice.into().into(),
         }
     }
 

@@ -12,9 +12,9 @@ pub fn zscore_keep(rows: &Rows<'_>, z_th: f64) -> Vec<bool> {
     (0..rows.len())
         .map(|i| {
             rows.copy_row(i, &mut row);
-            row.iter().enumerate().all(|(d, &x)| {
-                x.is_finite() && (m.std[d] == 0.0 || (x as f64 - m.mean[d]).abs() <= z_th * m.std[d])
-            })
+            row.iter()
+                .enumerate()
+                .all(|(d, &x)| x.is_finite() && (m.std[d] == 0.0 || (x as f64 - m.mean[d]).abs() <= z_th * m.std[d]))
         })
         .collect()
 }
@@ -26,7 +26,8 @@ mod tests {
     #[test]
     fn a_row_goes_when_any_dimension_is_out_and_dead_dimensions_do_not_count() {
         // 99 rows at ±1 and one at 50 in the second column; the third is constant.
-        let mut data: Vec<f32> = (0..99).flat_map(|i| [(i % 3) as f32, if i % 2 == 0 { 1.0 } else { -1.0 }, 0.1]).collect();
+        let mut data: Vec<f32> =
+            (0..99).flat_map(|i| [(i % 3) as f32, if i % 2 == 0 { 1.0 } else { -1.0 }, 0.1]).collect();
         data.extend([1.0, 50.0, 0.1]);
         let keep = zscore_keep(&Rows::new(&data, 3), 3.0);
         assert_eq!(keep.iter().filter(|&&k| !k).count(), 1);

@@ -106,10 +106,8 @@ pub struct Inspection {
 /// public files lost a row or two of their time-outs.
 pub fn inspect(data: &Transitions, step_limit: usize) -> Inspection {
     let episodes = data.episodes();
-    let complete: Vec<_> = episodes
-        .iter()
-        .filter(|e| data.terminals[e.end - 1] || e.end - e.start + 2 >= step_limit)
-        .collect();
+    let complete: Vec<_> =
+        episodes.iter().filter(|e| data.terminals[e.end - 1] || e.end - e.start + 2 >= step_limit).collect();
     let returns = if complete.is_empty() {
         Summary::of(episodes.iter().map(|e| e.episode_return))
     } else {

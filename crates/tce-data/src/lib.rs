@@ -21,6 +21,7 @@ mod filter;
 mod inspect;
 mod moments;
 mod neighbours;
+mod product;
 mod quality;
 mod reference;
 mod rows;

@@ -89,9 +89,8 @@ impl Moments {
         let n = |d: usize| (rough.count[d] as f64).max(1.0);
         let mean: Vec<f64> = (0..dim).map(|d| shift[d] + rough.sum[d] / n(d)).collect();
         let fine = pass(tables, &mean);
-        let std = (0..dim)
-            .map(|d| if rough.min[d] < rough.max[d] { (fine.square[d] / n(d)).sqrt() } else { 0.0 })
-            .collect();
+        let std =
+            (0..dim).map(|d| if rough.min[d] < rough.max[d] { (fine.square[d] / n(d)).sqrt() } else { 0.0 }).collect();
         Self { count: rough.count, mean, std, min: rough.min, max: rough.max, nan: rough.nan, infinite: rough.infinite }
     }
 }

@@ -164,7 +164,7 @@ mod tests {
                     };
                     assert!(r.min < r.max);
                     assert_eq!(r.normalised_score(r.min), 0.0);
-                    assert_eq!(r.normalised_score(r.max), 100.0);
+                    assert!((r.normalised_score(r.max) - 100.0).abs() < 1e-12);
                 }
             }
         }

@@ -1,0 +1,108 @@
+//! From [`Transitions`] to a file that D4RL's loaders and h5py read.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use hdf5_pure::{AttrValue, DatasetBuilder, EnumTypeBuilder, FileBuilder, make_i8_type};
+use tce_base::{AtomicFile, FileError};
+
+use super::{FORMAT, FORMAT_ATTRIBUTE};
+use crate::{DataError, Problem, Transitions};
+
+/// Bytes per chunk before compression: large enough to compress well, small enough to inflate a few at a time.
+const CHUNK_BYTES: usize = 512 * 1024;
+/// Float32 noise hardly compresses; higher levels cost time and save nothing.
+const DEFLATE_LEVEL: u32 = 4;
+
+/// Writes `data` in D4RL's layout with `next_observations`: `observations`, `actions`, `next_observations` (f32, (N, D)),
+/// `rewards` (f32, (N,)), `terminals`, `timeouts` (h5py booleans, (N,)), gzip and shuffle; `attributes` on the root;
+/// `columns` (f32, (N,)) beside the others. The file is complete or absent.
+///
+/// # Errors
+/// No rows, columns of other lengths, a column with a reserved name, a full disk.
+pub fn save_d4rl(
+    path: &Path,
+    data: &Transitions,
+    attributes: &BTreeMap<String, String>,
+    columns: &[(&str, &[f32])],
+) -> Result<(), DataError> {
+    validate(path, data, columns)?;
+    let mut builder = FileBuilder::new();
+    let boolean = EnumTypeBuilder::with_base(make_i8_type())
+        .u8_value("FALSE", 0)
+        .u8_value("TRUE", 1)
+        .build()
+        .expect("a constant type");
+    for (name, values, dim) in [
+        ("observations", &data.observations, data.obs_dim),
+        ("actions", &data.actions, data.act_dim),
+        ("next_observations", &data.next_observations, data.obs_dim),
+    ] {
+        let dataset = builder.create_dataset(name).with_f32_data(values);
+        compress(dataset, &[data.len(), dim], 4);
+    }
+    compress(builder.create_dataset("rewards").with_f32_data(&data.rewards), &[data.len()], 4);
+    for (name, flags) in [("terminals", &data.terminals), ("timeouts", &data.timeouts)] {
+        let bytes = flags.iter().map(|&f| f as u8).collect();
+        let dataset = builder.create_dataset(name).with_raw_data(boolean.clone(), bytes, data.len() as u64);
+        compress(dataset, &[data.len()], 1);
+    }
+    for (name, values) in columns {
+        compress(builder.create_dataset(name).with_f32_data(values), &[data.len()], 4);
+    }
+    builder.set_attr(FORMAT_ATTRIBUTE, AttrValue::VarLenString(FORMAT.into()));
+    for (name, value) in attributes.iter().filter(|(n, _)| *n != FORMAT_ATTRIBUTE) {
+        builder.set_attr(name, AttrValue::VarLenString(value.clone()));
+    }
+    let mut file = AtomicFile::create(path)?;
+    builder.finish_to(file.file()).map_err(|e| {
+        let source = match e {
+            hdf5_pure::Error::Io(e) => e,
+            other => std::io::Error::other(other.to_string()),
+        };
+        FileError::new(path, "write", source)
+    })?;
+    file.commit()?;
+    Ok(())
+}
+
+fn compress(dataset: &mut DatasetBuilder, shape: &[usize], element: usize) {
+    let row_bytes = element * shape[1..].iter().product::<usize>();
+    let mut chunk: Vec<u64> = shape.iter().map(|&d| d as u64).collect();
+    chunk[0] = shape[0].min((CHUNK_BYTES / row_bytes).max(1)) as u64;
+    let shape: Vec<u64> = shape.iter().map(|&d| d as u64).collect();
+    dataset.with_shape(&shape).with_chunks(&chunk).with_shuffle().with_deflate(DEFLATE_LEVEL);
+}
+
+fn validate(path: &Path, data: &Transitions, columns: &[(&str, &[f32])]) -> Result<(), DataError> {
+    let refuse = |problem, field: &str, found: String, expected: String| {
+        let advice = "Nothing was written; this is a mistake of the calling program";
+        Err(DataError::invalid(problem, path, field, found, expected, advice))
+    };
+    let n = data.len();
+    if n == 0 || data.obs_dim == 0 || data.act_dim == 0 {
+        let found = format!("{n} rows of {} observations and {} actions", data.obs_dim, data.act_dim);
+        return refuse(Problem::Empty, "observations", found, "at least one of each".into());
+    }
+    let own = [
+        ("observations", data.observations.len(), n * data.obs_dim),
+        ("actions", data.actions.len(), n * data.act_dim),
+        ("next_observations", data.next_observations.len(), n * data.obs_dim),
+        ("terminals", data.terminals.len(), n),
+        ("timeouts", data.timeouts.len(), n),
+    ];
+    let more = columns.iter().map(|(name, values)| (*name, values.len(), n));
+    for (name, found, expected) in own.into_iter().chain(more) {
+        if found != expected {
+            return refuse(Problem::RowCount, name, format!("{found} values"), format!("{expected} values"));
+        }
+    }
+    for (i, (name, _)) in columns.iter().enumerate() {
+        let taken = own.iter().any(|o| o.0 == *name) || *name == "rewards" || columns[..i].iter().any(|c| c.0 == *name);
+        if taken || name.is_empty() || name.contains('/') {
+            let expected = "a new name without a slash".to_owned();
+            return refuse(Problem::Value, name, "a reserved or repeated name".into(), expected);
+        }
+    }
+    Ok(())
+}
