@@ -160,7 +160,9 @@ fn fetch_in(platform: &Platform, work: &Path, target: &Path) -> Result<(), Strin
         .ok_or_else(|| format!("pip ended well but left no wheel in {}", work.display()))?;
     let library = work.join(LIBRARY);
     let mut unpack = python()?;
-    unpack.arg("-c").arg("import sys, zipfile; open(sys.argv[3], 'wb').write(zipfile.ZipFile(sys.argv[1]).read(sys.argv[2]))");
+    unpack
+        .arg("-c")
+        .arg("import sys, zipfile; open(sys.argv[3], 'wb').write(zipfile.ZipFile(sys.argv[1]).read(sys.argv[2]))");
     unpack.arg(&wheel).arg(format!("mujoco/{LIBRARY}")).arg(&library);
     run(&mut unpack)?;
 

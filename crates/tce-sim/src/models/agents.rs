@@ -34,14 +34,13 @@ fn motors(joints: &[(&str, f64)]) -> Vec<Motor> {
 /// The three joints of a robot that moves in the x-z plane. With `height`, they lie on the floor below the torso, which
 /// makes the root's z coordinate the height of the torso; without it, z counts from the start.
 fn planar_root(torso: Body, height: f64) -> Body {
-    let slide = |name, axis| Joint {
-        position: [0.0, 0.0, -height],
-        ..Joint::free_moving(name, JointKind::Slide, axis)
-    };
-    torso
-        .joint(slide("rootx", X))
-        .joint(Joint { reference: height, ..slide("rootz", Z) })
-        .joint(Joint::free_moving("rooty", JointKind::Hinge, Y))
+    let slide =
+        |name, axis| Joint { position: [0.0, 0.0, -height], ..Joint::free_moving(name, JointKind::Slide, axis) };
+    torso.joint(slide("rootx", X)).joint(Joint { reference: height, ..slide("rootz", Z) }).joint(Joint::free_moving(
+        "rooty",
+        JointKind::Hinge,
+        Y,
+    ))
 }
 
 fn half_cheetah() -> Robot {
@@ -154,13 +153,7 @@ fn walker2d() -> Robot {
         gravity: EARTH,
         density: 1000.0,
         total_mass: None,
-        contact: Contact {
-            between_bodies: false,
-            condim: 3,
-            margin: 0.0,
-            friction: [0.7, 0.1, 0.1],
-            solver: None,
-        },
+        contact: Contact { between_bodies: false, condim: 3, margin: 0.0, friction: [0.7, 0.1, 0.1], solver: None },
         limit_solver: None,
         torso: upright_torso().child(limb("", 0.9)).child(limb("_left", 1.9)),
         motors: motors(&["thigh", "leg", "foot", "thigh_left", "leg_left", "foot_left"].map(|joint| (joint, 100.0))),
@@ -198,13 +191,7 @@ fn ant() -> Robot {
         gravity: EARTH,
         density: 5.0,
         total_mass: None,
-        contact: Contact {
-            between_bodies: false,
-            condim: 3,
-            margin: 0.01,
-            friction: [1.0, 0.5, 0.5],
-            solver: None,
-        },
+        contact: Contact { between_bodies: false, condim: 3, margin: 0.01, friction: [1.0, 0.5, 0.5], solver: None },
         limit_solver: None,
         torso: Body::new("torso", [0.0, 0.0, 0.75], torso)
             .joint(Joint::free_moving("root", JointKind::Free, Z))

@@ -107,10 +107,8 @@ mod tests {
     #[test]
     fn a_sphere_is_a_sphere() {
         // Ant's torso by hand: r = .25, density 5: m = 5 * 4/3 pi / 64 = .1041666.. pi; I = .4 m / 16 = .025 m.
-        let p = of_geom(
-            &Geom { name: "torso".into(), radius: 0.25, shape: Shape::Sphere, sliding_friction: None },
-            5.0,
-        );
+        let p =
+            of_geom(&Geom { name: "torso".into(), radius: 0.25, shape: Shape::Sphere, sliding_friction: None }, 5.0);
         close(p.mass, std::f64::consts::PI * 5.0 / 48.0);
         for i in 0..3 {
             close(p.inertia[i][i], 0.025 * p.mass);

@@ -90,12 +90,7 @@ fn write_body(xml: &mut String, depth: usize, robot: &Robot, body: &Body, scale:
     line(
         xml,
         depth + 1,
-        &format!(
-            "<inertial pos=\"{}\" mass=\"{}\" fullinertia=\"{}\"/>",
-            list(&p.centre),
-            p.mass * scale,
-            list(&full)
-        ),
+        &format!("<inertial pos=\"{}\" mass=\"{}\" fullinertia=\"{}\"/>", list(&p.centre), p.mass * scale, list(&full)),
     );
     for joint in &body.joints {
         line(xml, depth + 1, &joint_text(robot, joint));

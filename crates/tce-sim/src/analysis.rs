@@ -1,0 +1,77 @@
+//! One-step predictions for states and actions that need not come from a rollout.
+
+use rayon::prelude::*;
+use tce_base::interrupted;
+use tce_data::{Agent, Shift};
+
+use crate::SimError;
+use crate::env::Env;
+use crate::models::compiled;
+
+/// What the simulator makes of a batch of states and actions.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Simulated {
+    /// s', `[N, obs_dim]`; NaN in rows in which the physics blew up.
+    pub next_observations: Vec<f32>,
+    /// r, `[N]`; NaN in rows in which the physics blew up.
+    pub rewards: Vec<f32>,
+    /// Whether the robot's rule ends the episode at s', `[N]`; true in rows in which the physics blew up.
+    pub terminals: Vec<bool>,
+}
+
+/// Rows that one environment simulates before the work is split further.
+const CHUNK: usize = 64;
+
+/// One step from each of `states` (`[N, obs_dim]`) under `actions` (`[N, act_dim]`), in parallel. What a state does not
+/// describe is treated as in [`Env::set_state`].
+///
+/// # Errors
+/// If the sizes do not fit the agent, an input is not finite, or the user interrupts.
+pub fn simulate(agent: Agent, shift: Shift, states: &[f32], actions: &[f32]) -> Result<Simulated, SimError> {
+    let (obs_dim, act_dim) = agent.dims();
+    let rows = states.len() / obs_dim;
+    for (what, found, expected) in
+        [("numbers in `states`", states.len(), rows * obs_dim), ("numbers in `actions`", actions.len(), rows * act_dim)]
+    {
+        if found != expected {
+            return Err(SimError::Dimension { what, agent, found, expected });
+        }
+    }
+    for (what, table, dim) in [("`states`", states, obs_dim), ("`actions`", actions, act_dim)] {
+        if let Some(at) = table.iter().position(|x| !x.is_finite()) {
+            return Err(SimError::NotFinite { what, row: at / dim, value: table[at] });
+        }
+    }
+    let model = compiled(agent, shift)?;
+    let mut out = Simulated {
+        next_observations: vec![0.0; rows * obs_dim],
+        rewards: vec![0.0; rows],
+        terminals: vec![false; rows],
+    };
+    out.next_observations
+        .par_chunks_mut(CHUNK * obs_dim)
+        .zip(out.rewards.par_chunks_mut(CHUNK))
+        .zip(out.terminals.par_chunks_mut(CHUNK))
+        .zip(states.par_chunks(CHUNK * obs_dim).zip(actions.par_chunks(CHUNK * act_dim)))
+        .try_for_each_init(
+            || Env::with_model(agent, model.clone()),
+            |env, (((next, rewards), terminals), (states, actions))| {
+                if interrupted() {
+                    return Err(SimError::Interrupted);
+                }
+                let inputs = states.chunks_exact(obs_dim).zip(actions.chunks_exact(act_dim));
+                let outputs = next.chunks_exact_mut(obs_dim).zip(rewards).zip(terminals);
+                for ((state, action), ((next, reward), terminal)) in inputs.zip(outputs) {
+                    env.set_state(state);
+                    let result = env.step(action, next);
+                    (*reward, *terminal) = (result.reward as f32, result.terminal);
+                    if result.unstable {
+                        next.fill(f32::NAN);
+                        (*reward, *terminal) = (f32::NAN, true);
+                    }
+                }
+                Ok(())
+            },
+        )?;
+    Ok(out)
+}

@@ -1,0 +1,312 @@
+//! Many environments in lockstep, so that a policy sees them as one batch.
+
+use mujoco_rs::prelude::MjModel;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+use tce_base::{Progress, Rng, Streams, interrupted};
+use tce_data::{Agent, Shift, Transitions};
+
+use crate::env::{EPISODE_LIMIT, Env};
+use crate::models::compiled;
+use crate::{SimError, StepResult};
+
+/// Something that chooses actions.
+pub trait Actor: Sync {
+    /// Fills `actions` (`[rows, act_dim]`, row-major, in [-1, 1]) for `observations` (`[rows, obs_dim]`).
+    /// `rngs` holds one generator per row, for actors that sample; a row's numbers must come from its own generator
+    /// only, so that they do not depend on which other rows are in the batch.
+    fn act(&self, observations: &[f32], rngs: &mut [Rng], actions: &mut [f32]);
+}
+
+impl<F: Fn(&[f32], &mut [Rng], &mut [f32]) + Sync> Actor for F {
+    fn act(&self, observations: &[f32], rngs: &mut [Rng], actions: &mut [f32]) {
+        self(observations, rngs, actions)
+    }
+}
+
+/// Uniformly random actions.
+#[derive(Clone, Copy, Debug)]
+pub struct UniformActor;
+
+impl Actor for UniformActor {
+    fn act(&self, _: &[f32], rngs: &mut [Rng], actions: &mut [f32]) {
+        let dim = actions.len() / rngs.len().max(1);
+        for (rng, row) in rngs.iter_mut().zip(actions.chunks_exact_mut(dim)) {
+            tce_base::random::fill_uniform(rng, row);
+            row.iter_mut().for_each(|a| *a = 2.0 * *a - 1.0);
+        }
+    }
+}
+
+/// How to collect.
+#[derive(Clone, Copy)]
+pub struct CollectOptions<'a> {
+    /// Rows in all.
+    pub rows: usize,
+    /// Environments in lockstep. The rows depend on it (each lane rolls episodes of its own), but not on the number of
+    /// threads.
+    pub lanes: usize,
+    /// Where the random numbers come from: streams `collect/reset` and `collect/action`, indexed by
+    /// `lane << 32 | episode`.
+    pub streams: Streams,
+    /// Where to report rows.
+    pub progress: Option<&'a Progress>,
+}
+
+impl CollectOptions<'_> {
+    /// `rows` rows on 32 lanes.
+    pub fn new(rows: usize, streams: Streams) -> Self {
+        Self { rows, lanes: 32, streams, progress: None }
+    }
+}
+
+/// The outcome of one episode.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeResult {
+    /// Sum of the rewards, undiscounted.
+    pub episode_return: f64,
+    /// Steps.
+    pub length: usize,
+    /// Whether the episode was given up because the physics blew up.
+    pub unstable: bool,
+}
+
+/// What the two kinds of rollout do with a step.
+trait Lane: Send {
+    /// Takes note of a step (s, a, r, s') and says how to go on. `after` is s' and may be overwritten by a reset.
+    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> bool;
+}
+
+struct Step<'a> {
+    before: &'a [f32],
+    action: &'a [f32],
+    after: &'a mut [f32],
+    result: StepResult,
+}
+
+/// The lanes that still run, row by row: everything an actor needs lies contiguous.
+struct Lockstep<L> {
+    agent: Agent,
+    lanes: Vec<(Env, L)>,
+    rngs: Vec<Rng>,
+    observations: Vec<f32>,
+    next: Vec<f32>,
+    actions: Vec<f32>,
+}
+
+impl<L: Lane> Lockstep<L> {
+    fn new(agent: Agent, model: &Arc<MjModel>, starts: impl Iterator<Item = (L, Rng, Rng)>) -> Self {
+        let (obs_dim, act_dim) = agent.dims();
+        let mut lanes = Vec::new();
+        let mut rngs = Vec::new();
+        let mut observations = Vec::new();
+        for (lane, mut reset, action) in starts {
+            let mut env = Env::with_model(agent, model.clone());
+            let row = observations.len();
+            observations.resize(row + obs_dim, 0.0);
+            env.reset(&mut reset, &mut observations[row..]);
+            lanes.push((env, lane));
+            rngs.push(action);
+        }
+        let rows = lanes.len();
+        Self { agent, lanes, rngs, observations, next: vec![0.0; rows * obs_dim], actions: vec![0.0; rows * act_dim] }
+    }
+
+    /// One step of every lane. Lanes that are done leave, in their order, into `finished`.
+    fn tick(&mut self, actor: &dyn Actor, finished: &mut Vec<L>) -> Result<(), SimError> {
+        let (obs_dim, act_dim) = self.agent.dims();
+        let rows = self.lanes.len();
+        let observations = &mut self.observations[..rows * obs_dim];
+        let next = &mut self.next[..rows * obs_dim];
+        let actions = &mut self.actions[..rows * act_dim];
+        actor.act(observations, &mut self.rngs, actions);
+        if let Some(at) = actions.iter().position(|a| !a.is_finite()) {
+            return Err(SimError::NotFinite { what: "the actor's actions", row: at / act_dim, value: actions[at] });
+        }
+        let running: Vec<bool> = self
+            .lanes
+            .par_iter_mut()
+            .zip(self.rngs.par_iter_mut())
+            .zip(observations.par_chunks_exact_mut(obs_dim).zip(next.par_chunks_exact_mut(obs_dim)))
+            .zip(actions.par_chunks_exact(act_dim))
+            .map(|((((env, lane), rng), (before, after)), action)| {
+                let result = env.step(action, after);
+                lane.advance(env, Step { before, action, after, result }, rng)
+            })
+            .collect();
+        std::mem::swap(&mut self.observations, &mut self.next);
+        if running.iter().all(|&r| r) {
+            return Ok(());
+        }
+        let mut kept = 0;
+        for (row, &runs) in running.iter().enumerate() {
+            if runs {
+                self.observations.copy_within(row * obs_dim..(row + 1) * obs_dim, kept * obs_dim);
+                kept += 1;
+            }
+        }
+        let mut flags = running.iter();
+        self.rngs.retain(|_| *flags.next().expect("one flag per row"));
+        let done = self.lanes.extract_if(.., {
+            let mut flags = running.iter();
+            move |_| !*flags.next().expect("one flag per row")
+        });
+        finished.extend(done.map(|(_, lane)| lane));
+        Ok(())
+    }
+}
+
+/// One lane of a collection: episodes one after another until the quota is reached.
+struct Collector {
+    index: u64,
+    quota: usize,
+    episode: u64,
+    steps: usize,
+    unstable: usize,
+    streams: Streams,
+    table: Transitions,
+}
+
+impl Collector {
+    fn stream(&self, name: &str) -> Rng {
+        self.streams.indexed(name, self.index << 32 | self.episode)
+    }
+}
+
+impl Lane for Collector {
+    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> bool {
+        let Step { before, action, after, result } = step;
+        let mut over = result.unstable;
+        if result.unstable {
+            self.unstable += 1;
+            // The episode ends with the row before, if it has one.
+            if self.steps > 0 {
+                *self.table.timeouts.last_mut().expect("this episode's rows") = true;
+            }
+        } else {
+            self.steps += 1;
+            let full = self.table.len() + 1 == self.quota;
+            let timeout = !result.terminal && (self.steps == EPISODE_LIMIT || full);
+            self.table.push(before, action, result.reward as f32, after, result.terminal, timeout);
+            over = result.terminal || timeout;
+        }
+        if self.table.len() == self.quota {
+            return false;
+        }
+        if over {
+            self.episode += 1;
+            self.steps = 0;
+            env.reset(&mut self.stream("collect/reset"), after);
+            *rng = self.stream("collect/action");
+        }
+        true
+    }
+}
+
+/// Rolls `actor` out until there are `options.rows` transitions: lane by lane, in time order within a lane. The last
+/// episode of a lane is cut with a time-out mark. The same bytes at any number of threads.
+///
+/// Steps in which the physics blew up are dropped (their episode ends with a time-out).
+///
+/// # Errors
+/// If options are out of range, the actor returns a number that is not finite, the physics blow up again and again, or
+/// the user interrupts.
+pub fn collect(
+    agent: Agent,
+    shift: Shift,
+    actor: &dyn Actor,
+    options: &CollectOptions<'_>,
+) -> Result<Transitions, SimError> {
+    if options.lanes == 0 {
+        return Err(SimError::Option { option: "lanes", found: 0, expected: "at least 1" });
+    }
+    let model = compiled(agent, shift)?;
+    let (obs_dim, act_dim) = agent.dims();
+    let lanes = options.lanes.min(options.rows);
+    let starts = (0..lanes).map(|lane| {
+        let quota = options.rows / lanes + usize::from(lane < options.rows % lanes);
+        let collector = Collector {
+            index: lane as u64,
+            quota,
+            episode: 0,
+            steps: 0,
+            unstable: 0,
+            streams: options.streams,
+            table: Transitions::with_capacity(obs_dim, act_dim, quota),
+        };
+        let (reset, action) = (collector.stream("collect/reset"), collector.stream("collect/action"));
+        (collector, reset, action)
+    });
+    let mut lockstep = Lockstep::new(agent, &model, starts);
+    let mut finished = Vec::with_capacity(lanes);
+    while !lockstep.lanes.is_empty() {
+        if interrupted() {
+            return Err(SimError::Interrupted);
+        }
+        let rows = lockstep.lanes.len() as u64;
+        lockstep.tick(actor, &mut finished)?;
+        if let Some(progress) = options.progress {
+            progress.inc(rows);
+        }
+        if let Some((_, lane)) = lockstep.lanes.iter().find(|(_, lane)| lane.unstable > 100 + lane.quota / 10) {
+            return Err(SimError::Unstable { agent, shift, count: lane.unstable, rows: lane.table.len() });
+        }
+    }
+    finished.sort_by_key(|lane| lane.index);
+    let mut out = Transitions::with_capacity(obs_dim, act_dim, options.rows);
+    for lane in finished {
+        out.extend(&lane.table);
+    }
+    Ok(out)
+}
+
+/// One episode of an evaluation.
+struct Evaluator {
+    index: usize,
+    result: EpisodeResult,
+}
+
+impl Lane for Evaluator {
+    fn advance(&mut self, _: &mut Env, step: Step<'_>, _: &mut Rng) -> bool {
+        let result = &mut self.result;
+        if step.result.unstable {
+            result.unstable = true;
+            return false;
+        }
+        result.episode_return += step.result.reward;
+        result.length += 1;
+        !step.result.terminal && result.length < EPISODE_LIMIT
+    }
+}
+
+/// Rolls out `episodes` whole episodes in lockstep and returns their outcomes in order. Random numbers come from the
+/// streams `evaluate/reset` and `evaluate/action`, indexed by episode: two policies evaluated with the same streams
+/// start from the same states.
+///
+/// # Errors
+/// If the actor returns a number that is not finite, or the user interrupts.
+pub fn evaluate(
+    agent: Agent,
+    shift: Shift,
+    actor: &dyn Actor,
+    episodes: usize,
+    streams: Streams,
+) -> Result<Vec<EpisodeResult>, SimError> {
+    let model = compiled(agent, shift)?;
+    let starts = (0..episodes).map(|index| {
+        let result = EpisodeResult { episode_return: 0.0, length: 0, unstable: false };
+        let i = index as u64;
+        (Evaluator { index, result }, streams.indexed("evaluate/reset", i), streams.indexed("evaluate/action", i))
+    });
+    let mut lockstep = Lockstep::new(agent, &model, starts);
+    let mut finished = Vec::with_capacity(episodes);
+    while !lockstep.lanes.is_empty() {
+        if interrupted() {
+            return Err(SimError::Interrupted);
+        }
+        lockstep.tick(actor, &mut finished)?;
+    }
+    finished.sort_by_key(|lane| lane.index);
+    Ok(finished.into_iter().map(|lane| lane.result).collect())
+}
