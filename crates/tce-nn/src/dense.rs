@@ -177,7 +177,7 @@ mod tests {
     }
 
     fn close(a: Tensor<3>, b: Tensor<3>, tolerance: f32) -> bool {
-        let (a, b) = (a.into_data().to_vec::<f32>().unwrap(), b.into_data().to_vec::<f32>().unwrap());
+        let (a, b) = (a.into_data().try_to_vec::<f32>().unwrap(), b.into_data().try_to_vec::<f32>().unwrap());
         let scale = b.iter().fold(1.0f32, |m, v| m.max(v.abs()));
         a.len() == b.len() && a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= tolerance * scale)
     }

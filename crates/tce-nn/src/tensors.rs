@@ -12,7 +12,7 @@ pub fn tensor(data: Vec<f32>, shape: [usize; 3], device: &Device) -> Tensor<3> {
 
 /// A tensor as a host array, row-major; detached from any autodiff graph.
 pub fn host<const D: usize>(t: Tensor<D>) -> Vec<f32> {
-    t.inner().into_data().into_vec().expect("tensors of this program are f32")
+    t.inner().into_data().try_into_vec().expect("tensors of this program are f32")
 }
 
 /// A minibatch under construction: members of a population side by side, each with its own rows.

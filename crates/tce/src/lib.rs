@@ -1,1 +1,21 @@
+//! The `tce` program as a library: tasks, presets and variants, the pipeline's stages, run directories and commands.
 
+mod actors;
+mod commands;
+mod config;
+mod diagnostics;
+mod error;
+mod expand;
+mod generator;
+mod inputs;
+mod learning;
+mod metrics;
+mod mixture;
+mod output;
+mod pipeline;
+mod stage;
+mod task;
+mod variant;
+
+pub use commands::Cli;
+pub use error::{Error, Result};

@@ -1,0 +1,100 @@
+//! `tce augment`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+use tce_data::{Transitions, save_d4rl};
+use tce_nn::cpu;
+
+use crate::config::ConfigArgs;
+use crate::error::Result;
+use crate::expand::{Generated, expand};
+use crate::inputs::Inputs;
+use crate::output::{Output, table};
+
+/// Arguments of `augment`.
+#[derive(Debug, Args)]
+pub struct Augment {
+    /// Many transitions of the unchanged robot (HDF5, D4RL's or OTDF's layout).
+    #[arg(long, value_name = "FILE")]
+    source: PathBuf,
+    /// Few transitions of the changed robot.
+    #[arg(long, value_name = "FILE")]
+    target: PathBuf,
+    /// The file to write: target rows, then generated rows; column `origin` is 0 and 1.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Write the generated rows alone.
+    #[arg(long)]
+    only_generated: bool,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Where trained networks are kept, for a second call with other settings.
+    #[arg(long, default_value = "runs")]
+    cache: PathBuf,
+    /// Replace an existing file.
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+#[derive(Serialize)]
+struct Augmented {
+    file: PathBuf,
+    target_rows: usize,
+    generated: Generated,
+}
+
+impl Augment {
+    /// Runs the command.
+    pub fn run(self, output: Output) -> Result<()> {
+        super::refuse_existing(&self.out, self.force)?;
+        let config = self.config.layered(None, None)?.config()?;
+        let inputs = Inputs::of_files(Some(&self.source), &self.target)?;
+        let expansion = expand(&inputs, &config, &[self.seed], &self.cache, &cpu())?;
+        let (generated, report) = (&expansion.tables[0], expansion.reports[0].clone());
+        let target = &inputs.target.rows;
+        let mut rows = Transitions::with_capacity(target.obs_dim, target.act_dim, target.len() + generated.len());
+        let mut origin = Vec::new();
+        if !self.only_generated {
+            rows.extend(target);
+            origin.resize(target.len(), 0.0);
+            // The last episode of the target must not run on into the generated rows.
+            if let (Some(timeout), Some(false)) = (rows.timeouts.last_mut(), target.terminals.last()) {
+                *timeout = true;
+            }
+        }
+        rows.extend(generated);
+        origin.resize(rows.len(), 1.0);
+        let attributes = BTreeMap::from([
+            ("source_sha256".to_owned(), inputs.source.as_ref().map_or_else(String::new, |s| s.hash.clone())),
+            ("target_sha256".to_owned(), inputs.target.hash.clone()),
+            ("seed".to_owned(), self.seed.to_string()),
+            ("config".to_owned(), config.to_toml()),
+            ("program".to_owned(), format!("tce {}", env!("CARGO_PKG_VERSION"))),
+        ]);
+        save_d4rl(&self.out, &rows, &attributes, &[("origin", &origin)])?;
+        let written = if self.only_generated { 0 } else { target.len() };
+        output.print(&Augmented { file: self.out, target_rows: written, generated: report }, |a| {
+            let g = &a.generated;
+            let row = [
+                a.file.display().to_string(),
+                a.target_rows.to_string(),
+                g.kept.to_string(),
+                format!("{:.1} %", 100.0 * (1.0 - g.kept as f64 / g.sampled as f64)),
+                format!("{:.1} %", 100.0 * g.outside_box),
+                g.labels.map_or("-".into(), |l| format!("{:.4}", l.action_rmse)),
+                g.labels.map_or("-".into(), |l| format!("{:.4}", l.reward_rmse)),
+            ];
+            let header = [
+                "file", "target rows", "generated rows", "filtered out", "actions clipped", "action RMSE", "reward RMSE",
+            ];
+            table(&header, [row])
+        });
+        Ok(())
+    }
+}

@@ -1,0 +1,132 @@
+//! `tce collect`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, reference_scores, save_d4rl};
+use tce_sim::EPISODE_LIMIT;
+
+use crate::actors::{Part, Recipe, shared_folder, stand_in};
+use crate::error::{Error, Result};
+use crate::output::{Output, table};
+use crate::task::parse_environment;
+
+/// Arguments of `collect`.
+#[derive(Debug, Args)]
+pub struct Collect {
+    /// The environment: hopper (source), hopper-morph, ant-gravity, ...
+    #[arg(long, value_parser = parse_environment)]
+    env: (Agent, Shift),
+    /// A policy (.safetensors or .npz), with its share of the rows behind a colon in mixtures: a.npz:0.3. May be repeated.
+    #[arg(long = "actor", value_name = "FILE[:WEIGHT]", required_unless_present = "quality")]
+    actors: Vec<String>,
+    /// Instead of actors: the stand-ins under TCE_SHARED for D4RL's data of this quality (source domain only).
+    #[arg(long, conflicts_with = "actors")]
+    quality: Option<Quality>,
+    /// Transitions to collect.
+    #[arg(long, default_value_t = 1_000_000)]
+    rows: usize,
+    /// The HDF5 file to write, in D4RL's layout.
+    #[arg(long)]
+    out: PathBuf,
+    /// Take the mean action instead of a sampled one.
+    #[arg(long)]
+    mean: bool,
+    /// Environments in lockstep; each has its own episodes, so the rows depend on it.
+    #[arg(long, default_value_t = 32)]
+    lanes: usize,
+    /// Seed of resets and actions.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Replace an existing file.
+    #[arg(long)]
+    force: bool,
+}
+
+#[derive(Serialize)]
+struct Collected {
+    file: PathBuf,
+    environment: String,
+    recipe: Recipe,
+    normalised_score: Option<f64>,
+    content: Inspection,
+    seconds: f64,
+}
+
+impl Collect {
+    /// Runs the command.
+    pub fn run(self, output: Output) -> Result<()> {
+        super::refuse_existing(&self.out, self.force)?;
+        if self.rows == 0 || self.lanes == 0 {
+            return Err(Error::Usage("--rows and --lanes must be at least 1".into()));
+        }
+        let (agent, shift) = self.env;
+        let recipe = match self.quality {
+            Some(_) if shift != Shift::Source => {
+                return Err(Error::Usage("--quality names source-domain data; give --actor for a changed robot".into()));
+            }
+            Some(quality) => {
+                let stand_in = stand_in(agent, quality, self.rows, self.seed, &shared_folder())?;
+                Recipe { rows: self.rows, mean: self.mean, lanes: self.lanes, ..stand_in }
+            }
+            None => {
+                let parts = self.actors.iter().map(|a| part(a)).collect::<Result<_>>()?;
+                let Self { rows, mean, lanes, seed, .. } = self;
+                Recipe { agent, shift, parts, rows, mean, lanes, seed }
+            }
+        };
+        let attributes = recipe.attributes()?;
+        let started = std::time::Instant::now();
+        let data = recipe.collect()?;
+        save_d4rl(&self.out, &data, &attributes, &[])?;
+        let content = tce_data::inspect(&data, EPISODE_LIMIT);
+        let reference = reference_scores(agent, shift, ScoreTable::default());
+        let collected = Collected {
+            file: self.out,
+            environment: format!("{agent}-{shift}"),
+            recipe,
+            normalised_score: reference.map(|r| r.normalised_score(content.returns.mean)),
+            content,
+            seconds: started.elapsed().as_secs_f64(),
+        };
+        output.print(&collected, |c| {
+            let row = [
+                c.file.display().to_string(),
+                c.content.rows.to_string(),
+                c.content.episodes.to_string(),
+                format!("{:.0}", c.content.lengths.mean),
+                format!("{:.1} ± {:.1}", c.content.returns.mean, c.content.returns.std),
+                c.normalised_score.map_or("-".into(), |s| format!("{s:.1}")),
+                format!("{:.0}", c.content.rows as f64 / c.seconds),
+            ];
+            table(&["file", "rows", "episodes", "length", "return", "score", "rows/s"], [row])
+        });
+        Ok(())
+    }
+}
+
+/// `FILE` or `FILE:WEIGHT`.
+fn part(text: &str) -> Result<Part> {
+    if let Some((file, weight)) = text.rsplit_once(':') {
+        if let Ok(weight) = weight.parse::<f64>() {
+            if weight > 0.0 && weight.is_finite() {
+                return Ok(Part { actor: file.into(), weight });
+            }
+            return Err(Error::Usage(format!("--actor {text}: a weight must be a positive number")));
+        }
+    }
+    Ok(Part { actor: text.into(), weight: 1.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_are_read_behind_the_last_colon() {
+        assert_eq!(part("a.npz").unwrap(), Part { actor: "a.npz".into(), weight: 1.0 });
+        assert_eq!(part("c:/a.npz:0.5").unwrap(), Part { actor: "c:/a.npz".into(), weight: 0.5 });
+        assert!(part("a.npz:-1").is_err());
+    }
+}

@@ -1,0 +1,218 @@
+//! `tce diagnose`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use serde::Serialize;
+use tce_base::Streams;
+use tce_data::Standardizer;
+use tce_diffusion::metrics::sliced_wasserstein;
+use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
+use tce_learn::TerminalHandling;
+use tce_nn::cpu;
+
+use crate::config::ConfigArgs;
+use crate::diagnostics::{Consistency, Quality, consistency, hold_out, quality, step_std};
+use crate::error::Result;
+use crate::expand::{Finisher, label_models};
+use crate::generator::Generator;
+use crate::inputs::{Inputs, Table};
+use crate::output::{Output, table};
+use crate::task::Task;
+
+/// Measure what a stage of the pipeline does.
+#[derive(Debug, Subcommand)]
+pub enum Diagnose {
+    /// The generator: every noise process with every sampler, against held-out rows and the simulator.
+    Generator(GeneratorArgs),
+}
+
+/// Arguments of `generator`.
+#[derive(Debug, Args)]
+pub struct GeneratorArgs {
+    /// The task.
+    task: Task,
+    /// Rows to sample for each figure.
+    #[arg(long, default_value_t = 4096)]
+    rows: usize,
+    /// Share of the target rows (whole episodes) to hold out.
+    #[arg(long, default_value_t = 0.2)]
+    held_out: f64,
+    /// Source data (default: collected from the actors found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
+    /// Target data (default: OTDF's file found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    target: Option<PathBuf>,
+    /// Where trained networks are kept.
+    #[arg(long, default_value = "runs")]
+    out: PathBuf,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Only the configured process and sampler instead of all combinations.
+    #[arg(long)]
+    only: bool,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+#[derive(Serialize)]
+struct Report {
+    task: Task,
+    training_rows: usize,
+    held_out_rows: usize,
+    /// SW between training and held-out states: what a perfect copy of the training rows would get.
+    sw_floor: f64,
+    /// Real rows with inferred actions.
+    real: Consistency,
+    rows: Vec<Row>,
+}
+
+#[derive(Serialize)]
+struct Row {
+    process: &'static str,
+    sampler: String,
+    #[serde(flatten)]
+    quality: Quality,
+}
+
+fn process_name(process: &Process) -> &'static str {
+    match process {
+        Process::Ve(_) => "VE as written",
+        Process::Vp(_) => "VP",
+        Process::Edm(_) => "EDM",
+    }
+}
+
+fn sampler_name(sampler: &Sampler) -> String {
+    match sampler {
+        Sampler::PredictorCorrector { steps, .. } => format!("PC-{steps}"),
+        Sampler::EulerMaruyama { steps } => format!("Euler-Maruyama-{steps}"),
+        Sampler::Heun { steps, .. } => format!("Heun-{steps}"),
+        Sampler::DpmSolver { steps, .. } => format!("DPM++(2M)-{steps}"),
+    }
+}
+
+impl Diagnose {
+    /// Runs the subcommand.
+    pub fn run(self, output: Output) -> Result<()> {
+        let Diagnose::Generator(args) = self;
+        args.run(output)
+    }
+}
+
+impl GeneratorArgs {
+    fn run(self, output: Output) -> Result<()> {
+        let config = self.config.layered(Some(self.task), None)?.config()?;
+        let inputs = Inputs::of_task(
+            self.task,
+            self.source.as_deref(),
+            self.target.as_deref(),
+            Some(config.source.rows),
+            &self.out.join("data"),
+        )?;
+        let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
+        let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
+        let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };
+        let training = &inputs.target.rows;
+        let device = cpu();
+        let seeds = [self.seed];
+        let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.out, &device)?;
+        let place = (self.task.agent, self.task.shift);
+
+        let processes = match self.only {
+            true => vec![config.generator.process],
+            false => vec![Process::Ve(Ve::default()), Process::Vp(Vp::default()), Process::Edm(Edm::default())],
+        };
+        let samplers = match self.only {
+            true => vec![config.generator.sampler],
+            false => vec![
+                Sampler::paper(),
+                Sampler::heun(18),
+                Sampler::dpm_solver(20),
+            ],
+        };
+        let mut rows = Vec::new();
+        let mut floors = None;
+        for process in processes {
+            let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
+            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.out, &device)?;
+            let finisher = Finisher {
+                units: &generator.units,
+                models: &models,
+                filter: &config.filter,
+                terminal: config.labels.terminal,
+                agent: inputs.agent,
+            };
+            if floors.is_none() {
+                let units = &generator.units;
+                let d = units.live.len();
+                let scale = Standardizer::fit(&units.take(&training.observations), d);
+                let states = |t: &tce_data::Transitions| scale.apply(&units.take(&t.observations));
+                let sw = sliced_wasserstein(&states(training), &states(&held_out), d, 256, &Streams::new(self.seed));
+                let pair = (held_out.observations.clone(), held_out.next_observations.clone());
+                let real = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
+                floors = Some((sw, consistency(place.0, place.1, &real, &step_std(training, &units.live), &units.live)?));
+            }
+            for sampler in &samplers {
+                let quality = quality(
+                    &generator,
+                    &models,
+                    &generator_config,
+                    sampler,
+                    &finisher,
+                    (training, &held_out),
+                    place,
+                    self.rows,
+                    self.seed,
+                )?;
+                eprintln!("{} {}: {quality:?}", process_name(&process), sampler_name(sampler));
+                rows.push(Row { process: process_name(&process), sampler: sampler_name(sampler), quality });
+            }
+        }
+        let (sw_floor, real) = floors.expect("at least one process");
+        let report = Report {
+            task: self.task,
+            training_rows: training.len(),
+            held_out_rows: held_out.len(),
+            sw_floor,
+            real,
+            rows,
+        };
+        output.print(&report, render);
+        Ok(())
+    }
+}
+
+fn render(r: &Report) -> String {
+    let lines = r.rows.iter().map(|row| {
+        let q = &row.quality;
+        [
+            row.process.to_owned(),
+            row.sampler.clone(),
+            q.evaluations.to_string(),
+            format!("{:.3}", q.sw_training),
+            format!("{:.3}", q.sw_held_out),
+            format!("{:.3}", q.std_ratio),
+            format!("{:.1}", q.largest),
+            format!("{:.3} / {:.3}", q.consistency.median, q.consistency.p90),
+            format!("{:.3} / {:.3}", q.consistency_expanded.median, q.consistency_expanded.p90),
+            format!("{:.0}", q.rows_per_second),
+        ]
+    });
+    let header = [
+        "process", "sampler", "NFE", "SW train", "SW held out", "std ratio", "max", "consistency y=0", "expanded", "rows/s",
+    ];
+    format!(
+        "{}: {} training rows, {} held out\nSW between training and held-out rows: {:.3}; consistency of held-out rows with \
+         inferred actions: {:.3} (p90 {:.3})\n{}",
+        r.task,
+        r.training_rows,
+        r.held_out_rows,
+        r.sw_floor,
+        r.real.median,
+        r.real.p90,
+        table(&header, lines)
+    )
+}

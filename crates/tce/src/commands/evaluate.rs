@@ -1,0 +1,74 @@
+//! `tce evaluate`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+use tce_base::Streams;
+use tce_data::{Agent, ScoreTable, Shift, reference_scores};
+
+use crate::actors::{Evaluation, evaluate, load_policy};
+use crate::error::{Error, Result};
+use crate::output::{Output, mean_std, table};
+use crate::task::parse_environment;
+
+/// Arguments of `evaluate`.
+#[derive(Debug, Args)]
+pub struct Evaluate {
+    /// Policies (.safetensors or .npz).
+    #[arg(required = true)]
+    policies: Vec<PathBuf>,
+    /// The environment: hopper (source), hopper-morph, ant-gravity, ...
+    #[arg(long, value_parser = parse_environment)]
+    env: (Agent, Shift),
+    /// Episodes.
+    #[arg(long, default_value_t = 10)]
+    episodes: usize,
+    /// Sample actions instead of taking the mean.
+    #[arg(long)]
+    sample: bool,
+    /// Seed of the resets (and of sampled actions).
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+#[derive(Serialize)]
+struct Evaluated {
+    policy: PathBuf,
+    environment: String,
+    #[serde(flatten)]
+    evaluation: Evaluation,
+}
+
+impl Evaluate {
+    /// Runs the command.
+    pub fn run(self, output: Output) -> Result<()> {
+        if self.episodes == 0 {
+            return Err(Error::Usage("--episodes must be at least 1".into()));
+        }
+        let (agent, shift) = self.env;
+        let reference = reference_scores(agent, shift, ScoreTable::default());
+        let policies: Vec<_> = self.policies.iter().map(|p| load_policy(p, agent)).collect::<Result<_>>()?;
+        let mut all = Vec::new();
+        for (path, policy) in self.policies.iter().zip(&policies) {
+            let streams = Streams::new(self.seed);
+            let evaluation = evaluate(policy, agent, shift, self.episodes, streams, !self.sample, reference)?;
+            all.push(Evaluated { policy: path.clone(), environment: format!("{agent}-{shift}"), evaluation });
+        }
+        output.print(&all, |all| {
+            let rows = all.iter().map(|e| {
+                let (mean, std) = mean_std(&e.evaluation.returns);
+                let lengths: Vec<f64> = e.evaluation.lengths.iter().map(|&l| l as f64).collect();
+                [
+                    e.policy.display().to_string(),
+                    e.evaluation.returns.len().to_string(),
+                    format!("{mean:.1} ± {std:.1}"),
+                    format!("{:.0}", mean_std(&lengths).0),
+                    e.evaluation.score.map_or("-".into(), |s| format!("{s:.1}")),
+                ]
+            });
+            table(&["policy", "episodes", "return", "length", "score"], rows)
+        });
+        Ok(())
+    }
+}

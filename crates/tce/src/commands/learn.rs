@@ -1,0 +1,118 @@
+//! `tce learn`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::Args;
+use serde::Serialize;
+use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, reference_scores};
+use tce_nn::cpu;
+
+use crate::config::{Algorithm, ConfigArgs};
+use crate::error::{Error, Result};
+use crate::learning::{Arena, Learned, MemberData, learn};
+use crate::metrics::Metrics;
+use crate::output::{Output, plus_minus, table};
+use crate::pipeline::seeds;
+use crate::task::parse_environment;
+
+/// Arguments of `learn`.
+#[derive(Debug, Args)]
+pub struct Learn {
+    /// The rows to learn from (HDF5). With --extra, half of every batch comes from here.
+    #[arg(long, value_name = "FILE")]
+    target: PathBuf,
+    /// Further rows: the source's, generated ones, or a mixture of both.
+    #[arg(long, value_name = "FILE")]
+    extra: Option<PathBuf>,
+    /// The learner (default: the configuration's).
+    #[arg(long, value_enum)]
+    algorithm: Option<Algorithm>,
+    /// bc: clone the best trajectories only, this share of them.
+    #[arg(long, value_name = "SHARE")]
+    top: Option<f64>,
+    /// Policies to learn; all of them are one training.
+    #[arg(long, default_value_t = 1)]
+    seeds: usize,
+    /// The first seed.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Evaluate in this environment at the end: hopper-morph, ...
+    #[arg(long, value_parser = parse_environment)]
+    env: Option<(Agent, Shift)>,
+    /// Directory for policies and metrics.
+    #[arg(long)]
+    out: PathBuf,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+#[derive(Serialize)]
+struct Report {
+    policies: Vec<PathBuf>,
+    seeds: Vec<u64>,
+    #[serde(flatten)]
+    learned: Learned,
+}
+
+impl Learn {
+    /// Runs the command.
+    pub fn run(mut self, output: Output) -> Result<()> {
+        if let Some(algorithm) = self.algorithm {
+            let name = serde_json::to_value(algorithm).expect("plain");
+            self.config.sets.push(format!("learner.algorithm={name}"));
+        }
+        self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
+        let config = self.config.layered(None, None)?.config()?;
+        let seeds = seeds(self.seed, self.seeds)?;
+        if self.out.join("metrics.jsonl").exists() {
+            return Err(Error::Usage(format!("{} holds the results of another learning; choose another --out", self.out.display())));
+        }
+        let dims = self.env.map(|(agent, _)| agent.dims());
+        let read = |path: &PathBuf| -> Result<Arc<_>> {
+            let loaded = load(path, &LoadOptions { dims, ..LoadOptions::default() })?;
+            eprintln!("{}", loaded.report);
+            Ok(Arc::new(loaded.transitions))
+        };
+        let target = read(&self.target)?;
+        let extra = self.extra.as_ref().map(read).transpose()?;
+        if let Some(extra) = &extra {
+            ensure_same_agent(extra, &target)?;
+        }
+        let arena = self.env.map(|(agent, shift)| Arena {
+            agent,
+            shift,
+            reference: reference_scores(agent, shift, ScoreTable::default()),
+        });
+        let member = |&seed: &u64| MemberData {
+            seed,
+            target: target.clone(),
+            extra: extra.clone(),
+            trajectories: vec![target.clone()],
+        };
+        let data = seeds.iter().map(member).collect();
+        let mut metrics = Metrics::open(&self.out)?;
+        tce_base::write_atomically(&self.out.join("config.toml"), config.to_toml().as_bytes())?;
+        let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, &cpu())?;
+        let mut files = Vec::new();
+        for (policy, seed) in policies.iter().zip(&seeds) {
+            let file = self.out.join(format!("policy-seed{seed}.safetensors"));
+            policy.save(&file)?;
+            files.push(file);
+        }
+        let report = Report { policies: files, seeds, learned };
+        tce_base::write_json(&self.out.join("summary.json"), &report)?;
+        output.print(&report, |r| {
+            let rows = r.policies.iter().enumerate().map(|(m, path)| {
+                let evaluation = r.learned.evaluations.get(m);
+                [
+                    path.display().to_string(),
+                    evaluation.map_or("-".into(), |e| plus_minus(&e.returns)),
+                    evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
+                ]
+            });
+            table(&["policy", "return", "score"], rows)
+        });
+        Ok(())
+    }
+}

@@ -1,0 +1,87 @@
+//! The command line: one file a command.
+
+use std::path::Path;
+
+use clap::{Parser, Subcommand};
+
+use crate::error::{Error, Result};
+use crate::output::Output;
+
+mod augment;
+mod collect;
+mod config;
+mod data;
+mod diagnose;
+mod evaluate;
+mod learn;
+mod run;
+
+/// Cross-domain offline reinforcement learning: a policy for a changed robot from many transitions of the old one and
+/// few of the new one.
+#[derive(Debug, Parser)]
+#[command(name = "tce", version, propagate_version = true)]
+pub struct Cli {
+    /// Print one JSON document instead of tables.
+    #[arg(long, global = true)]
+    json: bool,
+    /// Threads to use (default: all cores). The results do not depend on it.
+    #[arg(long, global = true, value_name = "N")]
+    threads: Option<usize>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// The whole pipeline on a benchmark task: data, augmentation, policy, evaluation, floors.
+    Run(run::Run),
+    /// Widen a target data set of your own with the help of a source data set; no simulator needed.
+    Augment(augment::Augment),
+    /// Learn a policy from data sets.
+    Learn(learn::Learn),
+    /// Roll a policy out and report its returns.
+    Evaluate(evaluate::Evaluate),
+    /// Roll trained actors out into a data set.
+    Collect(collect::Collect),
+    /// Look at, check and convert data sets.
+    #[command(subcommand)]
+    Data(data::Data),
+    /// Show the configuration and where every value comes from.
+    #[command(subcommand)]
+    Config(config::Config),
+    /// Measure what a stage of the pipeline does.
+    #[command(subcommand)]
+    Diagnose(diagnose::Diagnose),
+}
+
+impl Cli {
+    /// Runs the command.
+    pub fn run(self) -> Result<()> {
+        if let Some(threads) = self.threads {
+            if threads == 0 {
+                return Err(Error::Usage("--threads 0: expected at least 1".into()));
+            }
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+            pool.map_err(|e| Error::Failed(format!("cannot start {threads} threads: {e}")))?;
+        }
+        let output = Output { json: self.json };
+        match self.command {
+            Command::Run(args) => args.run(output),
+            Command::Augment(args) => args.run(output),
+            Command::Learn(args) => args.run(output),
+            Command::Evaluate(args) => args.run(output),
+            Command::Collect(args) => args.run(output),
+            Command::Data(command) => command.run(output),
+            Command::Config(command) => command.run(output),
+            Command::Diagnose(command) => command.run(output),
+        }
+    }
+}
+
+/// An output that exists is only replaced when the user says so.
+fn refuse_existing(path: &Path, force: bool) -> Result<()> {
+    if path.exists() && !force {
+        return Err(Error::Usage(format!("{} exists; choose another name, or say --force to replace it", path.display())));
+    }
+    Ok(())
+}

@@ -1,0 +1,137 @@
+//! `tce run`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+use tce_nn::cpu;
+
+use crate::config::ConfigArgs;
+use crate::error::Result;
+use crate::inputs::Inputs;
+use crate::output::{Output, plus_minus, table};
+use crate::pipeline::{Summary, run, seeds};
+use crate::task::Task;
+use crate::variant::Variant;
+
+/// Arguments of `run`.
+#[derive(Debug, Args)]
+pub struct Run {
+    /// The task: AGENT-SHIFT:SOURCE->TARGET, as in 'hopper-morph:medium->expert' (quote it: > is the shell's).
+    task: Task,
+    /// The methods, separated by commas.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "tce-og")]
+    variant: Vec<Variant>,
+    /// How many seeds; all of them are one training.
+    #[arg(long, default_value_t = 1)]
+    seeds: usize,
+    /// The first seed.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Source data (default: collected from the actors found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
+    /// Target data (default: OTDF's file found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    target: Option<PathBuf>,
+    /// Where results go.
+    #[arg(long, default_value = "runs")]
+    out: PathBuf,
+    /// Leave out the floors (cloning, cloning of the best half, IQL on the target alone).
+    #[arg(long)]
+    no_floors: bool,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+#[derive(Serialize)]
+struct Report {
+    task: Task,
+    rows: Vec<Row>,
+}
+
+#[derive(Serialize)]
+struct Row {
+    title: String,
+    variant: Variant,
+    floor: bool,
+    #[serde(flatten)]
+    summary: Summary,
+}
+
+impl Run {
+    /// Runs the command.
+    pub fn run(self, output: Output) -> Result<()> {
+        let mut variants: Vec<(Variant, bool)> = Vec::new();
+        if !self.no_floors {
+            let floors = Variant::FLOORS.into_iter().filter(|f| !self.variant.contains(f));
+            variants.extend(floors.map(|v| (v, true)));
+        }
+        variants.extend(self.variant.iter().map(|&v| (v, Variant::FLOORS.contains(&v))));
+        // Every configuration is read before anything is computed.
+        let configs = variants
+            .iter()
+            .map(|(v, _)| self.config.layered(Some(self.task), Some(*v))?.config())
+            .collect::<Result<Vec<_>>>()?;
+        let seeds = seeds(self.seed, self.seeds)?;
+        let source_rows = configs.iter().find(|c| c.needs_source()).map(|c| c.source.rows);
+        let needs_file = source_rows.is_some();
+        let inputs = Inputs::of_task(
+            self.task,
+            self.source.as_deref().filter(|_| needs_file),
+            self.target.as_deref(),
+            source_rows,
+            &self.out.join("data"),
+        )?;
+        let mut rows = Vec::new();
+        for ((variant, floor), config) in variants.into_iter().zip(&configs) {
+            let place = self.task.directory();
+            let summary = run(&variant.name(), &inputs, config, &seeds, &self.out, &place, &cpu())?;
+            rows.push(Row { title: variant.title().into(), variant, floor, summary });
+        }
+        output.print(&Report { task: self.task, rows }, render);
+        Ok(())
+    }
+}
+
+fn render(report: &Report) -> String {
+    let lines = report.rows.iter().map(|r| {
+        let returns: Vec<f64> =
+            r.summary.learned.evaluations.iter().map(|e| e.returns.iter().sum::<f64>() / e.returns.len() as f64).collect();
+        [
+            if r.floor { format!("{} (floor)", r.title) } else { r.title.clone() },
+            plus_minus(&r.summary.scores),
+            plus_minus(&returns),
+            r.summary.seeds.len().to_string(),
+            r.summary.extra_rows.to_string(),
+            format!("{:.0} s", r.summary.seconds),
+        ]
+    });
+    let header = ["method", "score", "return", "seeds", "other rows", "time"];
+    let mut text = format!("{}\n{}\n", report.task, table(&header, lines));
+    let generated = report.rows.iter().filter(|r| !r.summary.generated.is_empty()).map(|r| {
+        let mean = |f: &dyn Fn(&crate::expand::Generated) -> f64| {
+            r.summary.generated.iter().map(f).sum::<f64>() / r.summary.generated.len() as f64
+        };
+        [
+            r.title.clone(),
+            format!("{:.0}", mean(&|g| g.sampled as f64)),
+            format!("{:.1} %", 100.0 * mean(&|g| 1.0 - g.kept as f64 / g.sampled as f64)),
+            format!("{:.1} %", 100.0 * mean(&|g| g.outside_box)),
+            format!("{:.2} %", 100.0 * mean(&|g| g.terminal)),
+            format!("{:.4}", mean(&|g| g.labels.map_or(f64::NAN, |l| l.action_rmse))),
+            format!("{:.4}", mean(&|g| g.labels.map_or(f64::NAN, |l| l.reward_rmse))),
+        ]
+    });
+    let generated: Vec<_> = generated.collect();
+    if !generated.is_empty() {
+        let header =
+            ["generated", "sampled", "filtered out", "actions clipped", "terminal", "action RMSE", "reward RMSE"];
+        text += &table(&header, generated);
+        text += "\n";
+    }
+    for row in &report.rows {
+        text += &format!("{}: {}\n", row.title, row.summary.directory.display());
+    }
+    text
+}

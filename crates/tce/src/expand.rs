@@ -1,0 +1,230 @@
+//! Coverage expansion as one stage (Algorithm 1, lines 2 to 7): networks, samples, filter (Eq. 8), labels; one table of
+//! generated transitions per member.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_data::{Agent, LoadOptions, Rows, Standardizer, Transitions, load, save_d4rl, zscore_keep};
+use tce_learn::{LabelConfig, LabelErrors, LabelModels, Labelled, Learner, Member, TerminalHandling, train_labels};
+use tce_nn::{Device, NamedParameters};
+use tce_sim::terminal_rule;
+
+use crate::config::{Config, FilterConfig, LabelsConfig, Terminal};
+use crate::error::{Error, Result};
+use crate::generator::{Generator, Units};
+use crate::inputs::{InputSpec, Inputs};
+use crate::stage::Stage;
+
+/// What generating rows leaves behind, per member.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Generated {
+    /// The file in the stage.
+    pub file: String,
+    /// Rows sampled.
+    pub sampled: usize,
+    /// Rows that passed the filter.
+    pub kept: usize,
+    /// Share of inferred action components outside of the box, before clipping.
+    pub outside_box: f64,
+    /// Share of terminal rows.
+    pub terminal: f64,
+    /// Network evaluations per row, both stages of sampling together.
+    pub evaluations: usize,
+    /// Errors of the member's label models on held-out target rows.
+    pub labels: Option<LabelErrors>,
+}
+
+/// The inverse dynamics and reward models of a whole population: trained on the target rows, or taken from their stage.
+pub fn label_models(
+    inputs: &Inputs,
+    config: &LabelsConfig,
+    seeds: &[u64],
+    root: &Path,
+    device: &Device,
+) -> Result<(LabelModels, Stage, Vec<Option<LabelErrors>>)> {
+    #[derive(Serialize)]
+    struct Spec<'a> {
+        inputs: InputSpec,
+        seeds: &'a [u64],
+        labels: &'a LabelConfig,
+    }
+    let by_rule = config.terminal == Terminal::Rule && inputs.agent.is_some();
+    let learn_terminals = config.terminal != Terminal::None && !by_rule;
+    let labels = LabelConfig { learn_terminals, ..config.training.clone() };
+    let stage = Stage::open(root, "stages/labels", &Spec { inputs: inputs.spec(false), seeds, labels: &labels })?;
+    let target = Arc::new(inputs.target.rows.clone());
+    let member = |&seed: &u64| Member {
+        streams: Streams::new(seed),
+        parts: vec![target.clone()],
+        standardizer: Standardizer::identity(target.obs_dim),
+        reward_scale: 1.0,
+    };
+    let members: Vec<_> = seeds.iter().map(member).collect();
+    let file = "labels.safetensors";
+    let path = stage.file(file);
+    if let Some(errors) = stage.summary::<Vec<Option<LabelErrors>>>()? {
+        let mut models = LabelModels::new(&members, &labels, device)?;
+        models.restore(&NamedParameters::load(&path)?, &path)?;
+        return Ok((models, stage, errors));
+    }
+    let models = train_labels(&members, &labels, device)?.ok_or(Error::Interrupted)?;
+    let errors = models.errors();
+    models.state().save(&path)?;
+    stage.finish(&[file.to_owned()], &errors)?;
+    Ok((models, stage, errors))
+}
+
+/// Filters and labels state pairs of live dimensions.
+pub struct Finisher<'a> {
+    /// The units of the pairs.
+    pub units: &'a Units,
+    /// Inverse dynamics and reward.
+    pub models: &'a LabelModels,
+    /// Eq. 8.
+    pub filter: &'a FilterConfig,
+    /// Where terminal flags come from.
+    pub terminal: Terminal,
+    /// Whose rule, for [`Terminal::Rule`].
+    pub agent: Option<Agent>,
+}
+
+impl Finisher<'_> {
+    /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite never do.
+    fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
+        let d = self.units.live.len();
+        let finite = states.chunks_exact(d).zip(successors.chunks_exact(d)).map(|(s, s2)| {
+            s.iter().chain(s2).all(|v| v.is_finite())
+        });
+        let mut keep: Vec<bool> = finite.collect();
+        if self.filter.enabled {
+            let (states, successors) = (choose(states, d, &keep), choose(successors, d, &keep));
+            let pairs = Rows::join(&[(&states, d), (&successors, d)]);
+            let inliers = zscore_keep(&pairs, self.filter.z_threshold);
+            keep.iter_mut().filter(|k| **k).zip(inliers).for_each(|(keep, inlier)| *keep = inlier);
+        }
+        keep
+    }
+
+    /// Filters, labels, and makes tables of what is left: one pair of `[rows, d]` per member of the label models.
+    pub fn finish(&self, pairs: &[(&[f32], &[f32])]) -> Result<Vec<Labelled>> {
+        let d = self.units.live.len();
+        let mut kept = Vec::new();
+        for (states, successors) in pairs {
+            let keep = self.keep(states, successors);
+            let whole = |rows: &[f32]| self.units.put_back(&choose(rows, d, &keep));
+            let (s, s2) = (whole(states), whole(successors));
+            if s.is_empty() {
+                return Err(Error::Failed(format!(
+                    "the filter rejected all {} generated rows; is filter.z_threshold = {} meant?",
+                    keep.len(),
+                    self.filter.z_threshold
+                )));
+            }
+            kept.push((s, s2));
+        }
+        let rule = |agent: Agent| move |_: &[f32], s2: &[f32]| terminal_rule(agent, s2);
+        let agent_rule = self.agent.map(rule);
+        let terminals = match (self.terminal, &agent_rule) {
+            (Terminal::None, _) => TerminalHandling::None,
+            (Terminal::Rule, Some(rule)) => TerminalHandling::Rule(rule),
+            (Terminal::Rule | Terminal::Learned, _) => TerminalHandling::Learned,
+        };
+        Ok(self.models.label(&kept, terminals)?)
+    }
+}
+
+fn choose(rows: &[f32], d: usize, keep: &[bool]) -> Vec<f32> {
+    let kept = rows.chunks_exact(d).zip(keep).filter(|(_, keep)| **keep);
+    kept.flat_map(|(row, _)| row.iter().copied()).collect()
+}
+
+/// Generated tables, one per member, and where they are.
+pub struct Expansion {
+    /// The tables.
+    pub tables: Vec<Arc<Transitions>>,
+    /// What was noticed.
+    pub reports: Vec<Generated>,
+    /// The stage with the files.
+    pub stage: Stage,
+}
+
+/// Runs, or takes from its stage, the whole expansion.
+pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
+    #[derive(Serialize)]
+    struct Spec<'a> {
+        networks: String,
+        labels: String,
+        sampler: tce_diffusion::Sampler,
+        y_max: f32,
+        rows: usize,
+        filter: &'a FilterConfig,
+        terminal: Terminal,
+    }
+    let (generator, networks, _) = Generator::train(inputs, &config.generator, seeds, root, device)?;
+    let (models, labels, label_errors) = label_models(inputs, &config.labels, seeds, root, device)?;
+    let rows = match config.generator.rows {
+        0 => ((1.0 - config.mixture.lambda) * inputs.source_rows()?.len() as f64).round() as usize,
+        rows => rows,
+    };
+    let spec = Spec {
+        networks: networks.name(),
+        labels: labels.name(),
+        sampler: config.generator.sampler,
+        y_max: config.generator.y_max,
+        rows,
+        filter: &config.filter,
+        terminal: config.labels.terminal,
+    };
+    let stage = Stage::open(root, "stages/generated", &spec)?;
+    let (reports, tables) = match stage.summary::<Vec<Generated>>()? {
+        Some(reports) => {
+            let read = |g: &Generated| Ok(Arc::new(load(&stage.file(&g.file), &LoadOptions::default())?.transitions));
+            let tables = reports.iter().map(read).collect::<Result<Vec<_>>>()?;
+            (reports, tables)
+        }
+        None => {
+            let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
+            let target = &inputs.target.rows;
+            let (states, successors) = generator.sample_pairs(rows, &config.generator, &members, target)?;
+            let finisher = Finisher {
+                units: &generator.units,
+                models: &models,
+                filter: &config.filter,
+                terminal: config.labels.terminal,
+                agent: inputs.agent,
+            };
+            let per_member = rows * generator.units.live.len();
+            let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
+            let finished = finisher.finish(&pairs)?;
+            drop((states, successors));
+            let (mut reports, mut tables) = (Vec::new(), Vec::new());
+            for ((&seed, labelled), errors) in seeds.iter().zip(finished).zip(&label_errors) {
+                let table = labelled.transitions;
+                let file = format!("generated-seed{seed}.hdf5");
+                let attributes = BTreeMap::from([
+                    ("spec".to_owned(), serde_json::to_string(&spec).expect("plain data")),
+                    ("seed".to_owned(), seed.to_string()),
+                ]);
+                save_d4rl(&stage.file(&file), &table, &attributes, &[])?;
+                let terminals = table.terminals.iter().filter(|t| **t).count();
+                reports.push(Generated {
+                    file,
+                    sampled: rows,
+                    kept: table.len(),
+                    outside_box: labelled.outside_box,
+                    terminal: terminals as f64 / table.len() as f64,
+                    evaluations: 2 * config.generator.sampler.evaluations(),
+                    labels: *errors,
+                });
+                tables.push(Arc::new(table));
+            }
+            let files: Vec<_> = reports.iter().map(|r| r.file.clone()).collect();
+            stage.finish(&files, &reports)?;
+            (reports, tables)
+        }
+    };
+    Ok(Expansion { tables, reports, stage })
+}

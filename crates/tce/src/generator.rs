@@ -1,0 +1,357 @@
+//! The heart of TCE (Algorithm 1, lines 2 to 6): train q_mix and q_tran; sample states under ŷ ~ U(0, y_max), then their
+//! successors.
+//!
+//! Everything is trained on standardised, live dimensions: a dimension without spread in source and target (Ant's 84
+//! contact slots) is left out and put back as the constant it is.
+
+use std::sync::{Mutex, PoisonError};
+
+use serde::{Deserialize, Serialize};
+use tce_base::{Progress, Streams};
+use tce_data::{Rows, Standardizer, Transitions};
+use tce_diffusion::{
+    Condition, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel, Target, TrainConfig, Trainer, uniform_labels,
+};
+use tce_nn::Device;
+
+use crate::config::GeneratorConfig;
+use crate::error::Result;
+use crate::inputs::Inputs;
+use crate::metrics::Metrics;
+use crate::stage::Stage;
+
+/// Trained score networks and label models of a whole population, with the maps between their units and the data's.
+pub struct Generator {
+    /// Maps of the networks.
+    pub units: Units,
+    /// q_mix.
+    pub state: ScoreModel,
+    /// q_tran.
+    pub transition: ScoreModel,
+}
+
+/// Between the data's units and the networks'.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Units {
+    /// Dimension of s in the data.
+    pub obs_dim: usize,
+    /// Dimension of a.
+    pub act_dim: usize,
+    /// The dimensions that the networks see.
+    pub live: Vec<usize>,
+    /// A state whose dead dimensions have their constant values.
+    pub template: Vec<f32>,
+    /// Of live states.
+    pub state: Standardizer,
+    /// Of what q_tran generates, s' or s' - s.
+    pub output: Standardizer,
+    /// What q_tran generates.
+    pub target: Target,
+}
+
+/// `n` rows spread evenly over `all`.
+fn spread(all: &Transitions, n: usize) -> Vec<f32> {
+    let n = n.min(all.len());
+    (0..n).flat_map(|i| all.observation(i * all.len() / n).iter().copied()).collect()
+}
+
+impl Units {
+    /// The units in which batches have zero mean and unit variance: source and target count the same, as in a balanced
+    /// batch, however many more source rows there are.
+    pub fn fit(target: &Transitions, source: Option<&Transitions>, kind: Target) -> Self {
+        let d = target.obs_dim;
+        let few = source.map(|s| spread(s, target.len())).unwrap_or_default();
+        let mut tables = vec![Rows::new(&target.observations, d)];
+        if !few.is_empty() {
+            tables.push(Rows::new(&few, d));
+        }
+        let all = Standardizer::fit_on(&tables);
+        let live = all.live();
+        let pick = |values: &[f32]| live.iter().map(|&k| values[k]).collect();
+        let state = Standardizer { mean: pick(&all.mean), std: pick(&all.std), dead: vec![], floored: vec![] };
+        let units = Self {
+            obs_dim: d,
+            act_dim: target.act_dim,
+            template: all.mean.clone(),
+            live,
+            output: state.clone(),
+            state,
+            target: kind,
+        };
+        let rows = kind.encode(&units.take(&target.observations), &units.take(&target.next_observations));
+        Self { output: Standardizer::fit(&rows, units.live.len()), ..units }
+    }
+
+    /// The live dimensions of row-major states.
+    pub fn take(&self, states: &[f32]) -> Vec<f32> {
+        states.chunks_exact(self.obs_dim).flat_map(|row| self.live.iter().map(|&k| row[k])).collect()
+    }
+
+    /// Whole states from live dimensions.
+    pub fn put_back(&self, live: &[f32]) -> Vec<f32> {
+        let mut out = Vec::with_capacity(live.len() / self.live.len() * self.obs_dim);
+        for row in live.chunks_exact(self.live.len()) {
+            let start = out.len();
+            out.extend_from_slice(&self.template);
+            self.live.iter().zip(row).for_each(|(&k, &v)| out[start + k] = v);
+        }
+        out
+    }
+
+    /// Live, standardised states.
+    pub fn states(&self, states: &[f32]) -> Vec<f32> {
+        self.state.apply(&self.take(states))
+    }
+}
+
+/// What training the networks leaves behind.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Trained {
+    /// The maps.
+    pub units: Units,
+    /// Last reported loss of q_mix, per member.
+    pub state_loss: Vec<f32>,
+    /// Last reported loss of q_tran, per member.
+    pub transition_loss: Vec<f32>,
+    /// Seconds of training, all members together.
+    pub seconds: f64,
+}
+
+/// What decides the trained networks.
+#[derive(Serialize)]
+struct TrainingSpec<'a> {
+    inputs: crate::inputs::InputSpec,
+    seeds: &'a [u64],
+    process: tce_diffusion::Process,
+    target: Target,
+    state_steps: u64,
+    transition_steps: u64,
+    batch: usize,
+    learning_rate: f64,
+    ema: f64,
+    balanced: bool,
+    source_states: bool,
+}
+
+impl Generator {
+    /// Trains the networks, or takes them from the stage under `root` if they are there.
+    pub fn train(
+        inputs: &Inputs,
+        config: &GeneratorConfig,
+        seeds: &[u64],
+        root: &std::path::Path,
+        device: &Device,
+    ) -> Result<(Self, Stage, Trained)> {
+        let g = config;
+        let spec = TrainingSpec {
+            inputs: inputs.spec(g.source_states),
+            seeds,
+            process: g.process,
+            target: g.target,
+            state_steps: g.state_steps,
+            transition_steps: g.transition_steps,
+            batch: g.batch,
+            learning_rate: g.learning_rate,
+            ema: g.ema,
+            balanced: g.balanced,
+            source_states: g.source_states,
+        };
+        let stage = Stage::open(root, "stages/networks", &spec)?;
+        let files = ["state.safetensors", "transition.safetensors"];
+        if let Some(trained) = stage.summary::<Trained>()? {
+            let [state, transition] = files.map(|f| stage.file(f));
+            let generator = Self {
+                units: trained.units.clone(),
+                state: ScoreModel::load(&state, device)?,
+                transition: ScoreModel::load(&transition, device)?,
+            };
+            return Ok((generator, stage, trained));
+        }
+        let started = std::time::Instant::now();
+        let mut metrics = Metrics::open(stage.directory())?;
+        let (generator, mut trained) = Self::train_now(inputs, config, seeds, device, &mut metrics)?;
+        trained.seconds = started.elapsed().as_secs_f64();
+        generator.state.save(&stage.file(files[0]))?;
+        generator.transition.save(&stage.file(files[1]))?;
+        stage.finish(&files.map(String::from), &trained)?;
+        Ok((generator, stage, trained))
+    }
+
+    fn train_now(
+        inputs: &Inputs,
+        config: &GeneratorConfig,
+        seeds: &[u64],
+        device: &Device,
+        metrics: &mut Metrics,
+    ) -> Result<(Self, Trained)> {
+        let g = config;
+        let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
+        let target = &inputs.target.rows;
+        let source = if g.source_states { Some(inputs.source_rows()?) } else { None };
+        let units = Units::fit(target, source, g.target);
+        let d = units.live.len();
+        let train = TrainConfig { learning_rate: g.learning_rate, batch: g.batch, ema: g.ema, ..TrainConfig::default() };
+        let (s, s2) = (units.take(&target.observations), units.take(&target.next_observations));
+        let target_states = units.state.apply(&s);
+
+        // q_mix: the label says whose state it is (Eq. 5). q_tran: target rows alone. Neither needs the other, so they
+        // train side by side where there are two threads.
+        let source_states = source.map(|t| units.states(&t.observations)).unwrap_or_default();
+        let outputs = units.output.apply(&g.target.encode(&s, &s2));
+        let state_data = match source {
+            Some(_) => ScoreData::labelled(&source_states, &target_states, d, g.balanced)?,
+            None => {
+                let condition = Condition::Constant(vec![0.0]);
+                ScoreData::new(vec![Part { rows: &target_states, condition }], d, 1, false)?
+            }
+        };
+        let transition_data = ScoreData::conditioned(&outputs, d, &target_states, d)?;
+        let mut state = Trainer::new("state", NetworkConfig::new(d, 1), g.process, train, &members, device)?;
+        let mut transition = Trainer::new("transition", NetworkConfig::new(d, d), g.process, train, &members, device)?;
+        let metrics = Mutex::new(metrics);
+        let mut state_run = || run(&mut state, &state_data, g.state_steps, &metrics, "state");
+        let mut transition_run = || run(&mut transition, &transition_data, g.transition_steps, &metrics, "transition");
+        let (state_loss, transition_loss) = if rayon::current_num_threads() > 1 {
+            std::thread::scope(|scope| {
+                let other = scope.spawn(transition_run);
+                let state_loss = state_run();
+                (state_loss, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            })
+        } else {
+            (state_run(), transition_run())
+        };
+        let (state_loss, transition_loss) = (state_loss?, transition_loss?);
+        let trained = Trained { units: units.clone(), state_loss, transition_loss, seconds: 0.0 };
+        Ok((Self { units, state: state.model(), transition: transition.model() }, trained))
+    }
+
+    /// Samples `rows` states per member under ŷ ~ U(0, y_max): live dimensions in the data's units, `[P, rows, d]`.
+    pub fn sample_states(
+        &self,
+        rows: usize,
+        y_max: f32,
+        sampler: &Sampler,
+        members: &[Streams],
+        target: &Transitions,
+    ) -> Result<Vec<f32>> {
+        let labels: Vec<f32> = members.iter().flat_map(|m| uniform_labels(m, "state", rows, y_max)).collect();
+        let start = self.start_rows(&self.units.states(&target.observations), rows, members, "state");
+        let progress = progress("sample states", rows * members.len(), sampler);
+        let request = Request { name: "state", rows, condition: &labels, start: Some(&start) };
+        let mut states = self.state.sample(request, sampler, members, Some(&progress))?;
+        progress.finish();
+        self.units.state.invert_in_place(&mut states);
+        Ok(states)
+    }
+
+    /// Samples a successor for every state (live dimensions, the data's units, `[P, rows, d]`).
+    pub fn sample_successors(
+        &self,
+        states: &[f32],
+        sampler: &Sampler,
+        members: &[Streams],
+        target: &Transitions,
+    ) -> Result<Vec<f32>> {
+        let d = self.units.live.len();
+        let rows = states.len() / (d * members.len());
+        let condition = self.units.state.apply(states);
+        let outputs = {
+            let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
+            self.units.output.apply(&self.units.target.encode(&s, &s2))
+        };
+        let start = self.start_rows(&outputs, rows, members, "successor");
+        let progress = progress("sample successors", rows * members.len(), sampler);
+        let request = Request { name: "successor", rows, condition: &condition, start: Some(&start) };
+        let mut out = self.transition.sample(request, sampler, members, Some(&progress))?;
+        progress.finish();
+        self.units.output.invert_in_place(&mut out);
+        self.units.target.decode(states, &mut out);
+        Ok(out)
+    }
+
+    /// Training rows for processes that start at data; drawn in any case, since they are cheap.
+    fn start_rows(&self, training: &[f32], rows: usize, members: &[Streams], name: &str) -> Vec<f32> {
+        use rand::RngExt;
+        if !self.state.process().starts_at_data() {
+            return vec![0.0; rows * members.len() * self.units.live.len()];
+        }
+        let d = self.units.live.len();
+        let n = training.len() / d;
+        let mut out = Vec::with_capacity(rows * members.len() * d);
+        for member in members {
+            let mut rng = member.stream(&format!("start/{name}"));
+            for _ in 0..rows {
+                let i = rng.random_range(0..n);
+                out.extend_from_slice(&training[i * d..(i + 1) * d]);
+            }
+        }
+        out
+    }
+
+    /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, y_max) and their successors.
+    pub fn sample_pairs(
+        &self,
+        rows: usize,
+        config: &GeneratorConfig,
+        members: &[Streams],
+        target: &Transitions,
+    ) -> Result<(Vec<f32>, Vec<f32>)> {
+        let states = self.sample_states(rows, config.y_max, &config.sampler, members, target)?;
+        let successors = self.sample_successors(&states, &config.sampler, members, target)?;
+        Ok((states, successors))
+    }
+}
+
+fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress {
+    Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
+}
+
+fn run(trainer: &mut Trainer, data: &ScoreData, steps: u64, metrics: &Mutex<&mut Metrics>, name: &str) -> Result<Vec<f32>> {
+    let mut last = Vec::new();
+    trainer.train(std::slice::from_ref(data), steps, |step, losses| {
+        last = losses.to_vec();
+        if step % 500 == 0 || step == steps {
+            let mut metrics = metrics.lock().unwrap_or_else(PoisonError::into_inner);
+            for (m, &loss) in losses.iter().enumerate() {
+                // A metric that cannot be written must not cost the training.
+                let _ = metrics.log(name, step, m, [("loss", loss as f64)]);
+            }
+        }
+    })?;
+    Ok(last)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dead_dimensions_come_back_as_their_constants() {
+        let mut t = Transitions::new(3, 1);
+        for i in 0..10 {
+            let x = i as f32;
+            t.push(&[x, 0.5, -x], &[0.0], 0.0, &[x + 1.0, 0.5, -x - 1.0], false, false);
+        }
+        let units = Units::fit(&t, None, Target::Delta);
+        assert_eq!(units.live, [0, 2]);
+        let live = units.take(&t.observations);
+        assert_eq!(units.put_back(&live), t.observations);
+        let standardised = units.states(&t.observations);
+        let mean: f32 = standardised.iter().sum::<f32>() / standardised.len() as f32;
+        assert!(mean.abs() < 1e-6);
+    }
+
+    #[test]
+    fn source_and_target_weigh_the_same_in_the_units() {
+        let table = |value: f32, rows: usize| {
+            let mut t = Transitions::new(1, 1);
+            for i in 0..rows {
+                let x = value + (i % 2) as f32 * 1e-3;
+                t.push(&[x], &[0.0], 0.0, &[x], false, false);
+            }
+            t
+        };
+        let units = Units::fit(&table(0.0, 100), Some(&table(10.0, 10_000)), Target::Next);
+        assert!((units.state.mean[0] - 5.0).abs() < 0.01 && (units.state.std[0] - 5.0).abs() < 0.01);
+    }
+}

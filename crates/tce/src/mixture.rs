@@ -1,0 +1,155 @@
+//! D_mix^λ: which rows join the target rows (Section 4.4), besides or instead of generated ones.
+//!
+//! | rows | meaning |
+//! |---|---|
+//! | nearest | λ-quantile of the distance to the nearest target row in [s, a, s'] (Eq. 9) |
+//! | transport | λ share with the least optimal-transport cost, in OTDF's blocks |
+//! | all | D_src as it is (IQL*) |
+//! | relabelled | D_src with the actions that the target's inverse dynamics infers (SwT) |
+//!
+//! Source and generated rows stand λ : (1 − λ) in the mixture. The paper generates (1 − λ)|D_src| rows; where fewer are
+//! generated, the mixture shrinks and its ratio stays.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use serde::Serialize;
+use tce_base::Streams;
+use tce_data::{
+    NeighbourOptions, Rows, Transitions, TransportOptions, lambda_quantile_select, nn_distances, transport_costs,
+};
+use tce_learn::{LabelModels, TerminalHandling};
+use tce_nn::NamedParameters;
+
+use crate::config::{MixtureConfig, SourceRows};
+use crate::error::{Error, Result};
+use crate::inputs::Inputs;
+use crate::stage::Stage;
+
+/// The rows of a mixture that are not target rows, per member; `None` for target rows alone.
+pub fn extra_rows(
+    inputs: &Inputs,
+    mixture: &MixtureConfig,
+    generated: Option<&[Arc<Transitions>]>,
+    labels: Option<&LabelModels>,
+    seeds: &[u64],
+    root: &Path,
+) -> Result<Option<Vec<Arc<Transitions>>>> {
+    let selected: Option<Vec<Arc<Transitions>>> = match mixture.source {
+        SourceRows::None => None,
+        SourceRows::All => {
+            let all = Arc::new(inputs.source_rows()?.clone());
+            Some(vec![all; seeds.len()])
+        }
+        SourceRows::Relabelled => {
+            let models = labels.ok_or_else(|| Error::Failed("relabelling needs the label models".into()))?;
+            let source = inputs.source_rows()?;
+            let pairs = vec![(source.observations.clone(), source.next_observations.clone()); seeds.len()];
+            // Only the actions are inferred; everything else stays as the source has it.
+            let labelled = models.label(&pairs, TerminalHandling::None)?;
+            let table = |l: tce_learn::Labelled| Arc::new(Transitions { actions: l.transitions.actions, ..source.clone() });
+            Some(labelled.into_iter().map(table).collect())
+        }
+        SourceRows::Nearest | SourceRows::Transport => {
+            let source = inputs.source_rows()?;
+            let indices = lambda_quantile_select(&distances(inputs, mixture.source, root)?, mixture.lambda);
+            let rows = Arc::new(source.select(&indices));
+            Some(vec![rows; seeds.len()])
+        }
+    };
+    let generated = if mixture.generated { generated } else { None };
+    Ok(match (generated, selected) {
+        (None, selected) => selected,
+        (Some(generated), None) => Some(generated.to_vec()),
+        (Some(generated), Some(selected)) => Some(
+            generated
+                .iter()
+                .zip(&selected)
+                .zip(seeds)
+                .map(|((g, s), &seed)| Arc::new(mix(s, g, mixture.lambda, seed)))
+                .collect(),
+        ),
+    })
+}
+
+/// Source and generated rows in the ratio λ : (1 − λ), as many as there are of both; what is too many is left out at
+/// random.
+fn mix(source: &Transitions, generated: &Transitions, lambda: f64, seed: u64) -> Transitions {
+    let total = (source.len() as f64 / lambda).min(generated.len() as f64 / (1.0 - lambda));
+    let (n_source, n_generated) = ((lambda * total).round() as usize, ((1.0 - lambda) * total).round() as usize);
+    let mut out = subset(source, n_source, Streams::new(seed), "mixture/source");
+    out.extend(&subset(generated, n_generated, Streams::new(seed), "mixture/generated"));
+    out
+}
+
+/// `n` rows at random, in their order.
+fn subset(rows: &Transitions, n: usize, streams: Streams, name: &str) -> Transitions {
+    if n >= rows.len() {
+        return rows.clone();
+    }
+    let mut indices = rand::seq::index::sample(&mut streams.stream(name), rows.len(), n).into_vec();
+    indices.sort_unstable();
+    rows.select(&indices)
+}
+
+#[derive(Serialize)]
+struct DistanceSpec {
+    inputs: crate::inputs::InputSpec,
+    kind: SourceRows,
+}
+
+/// One number per source row, the smaller the closer to the target; computed once per pair of data sets.
+pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f32>> {
+    let stage = Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(true), kind })?;
+    let file = stage.file("distances.safetensors");
+    if stage.summary::<usize>()?.is_some() {
+        let mut loaded = NamedParameters::load(&file)?;
+        return loaded
+            .tensors
+            .remove("distances")
+            .map(|(_, values)| values)
+            .ok_or_else(|| Error::missing(&file, "no tensor `distances`; remove the directory to compute it again"));
+    }
+    let (source, target) = (Rows::transitions(inputs.source_rows()?), Rows::transitions(&inputs.target.rows));
+    let values = match kind {
+        SourceRows::Transport => transport_costs(&source, &target, &TransportOptions::default())?,
+        _ => nn_distances(&source, &target, &NeighbourOptions::default())?,
+    };
+    let mut out = NamedParameters::default();
+    out.tensors.insert("distances".into(), (vec![values.len()], values.clone()));
+    out.save(&file)?;
+    stage.finish(&["distances.safetensors".into()], values.len())?;
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rows(value: f32, n: usize) -> Transitions {
+        let mut t = Transitions::new(1, 1);
+        for _ in 0..n {
+            t.push(&[value], &[0.0], 0.0, &[value], false, false);
+        }
+        t
+    }
+
+    #[test]
+    fn the_ratio_is_kept_whatever_is_scarce() {
+        for (n_source, n_generated) in [(1000, 900), (10, 900), (1000, 18)] {
+            let mixed = mix(&rows(1.0, n_source), &rows(0.0, n_generated), 0.1, 0);
+            let share = mixed.observations.iter().sum::<f32>() / mixed.len() as f32;
+            assert!((share - 0.1).abs() < 0.03, "{n_source} {n_generated}: {share}");
+            assert!(mixed.len() >= 20);
+        }
+    }
+
+    #[test]
+    fn a_subset_is_reproducible_and_without_repetition() {
+        let mut t = Transitions::new(1, 1);
+        (0..100).for_each(|i| t.push(&[i as f32], &[0.0], 0.0, &[0.0], false, false));
+        let a = subset(&t, 30, Streams::new(1), "x");
+        assert_eq!(a, subset(&t, 30, Streams::new(1), "x"));
+        assert!(a.observations.windows(2).all(|w| w[0] < w[1]));
+    }
+}

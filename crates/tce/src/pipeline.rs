@@ -1,0 +1,161 @@
+//! One variant on one pair of data sets, from rows to scores, in a directory that holds everything about it.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+use tce_base::write_atomically;
+use tce_nn::Device;
+
+use crate::config::{Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows};
+use crate::error::{Error, Result};
+use crate::expand::{Generated, expand, label_models};
+use crate::inputs::{InputSpec, Inputs};
+use crate::learning::{Arena, Learned, MemberData, learn};
+use crate::metrics::Metrics;
+use crate::mixture::extra_rows;
+use crate::stage::Stage;
+
+/// The outcome of a variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// The variant's name, or what the user called the run.
+    pub name: String,
+    /// The seeds, one member each.
+    pub seeds: Vec<u64>,
+    /// Normalised score per seed.
+    pub scores: Vec<f64>,
+    /// Learning and evaluation.
+    pub learned: Learned,
+    /// Rows that joined the target rows, per member.
+    pub extra_rows: usize,
+    /// The generated rows, per member; empty if there are none.
+    pub generated: Vec<Generated>,
+    /// Seconds from data to scores, without stages that were there already.
+    pub seconds: f64,
+    /// Where everything is.
+    pub directory: PathBuf,
+}
+
+/// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
+#[derive(Serialize)]
+struct RunSpec<'a> {
+    inputs: InputSpec,
+    seeds: &'a [u64],
+    mixture: &'a MixtureConfig,
+    learner: serde_json::Value,
+    evaluation: &'a EvaluationConfig,
+    generator: Option<&'a GeneratorConfig>,
+    filter: Option<&'a FilterConfig>,
+    labels: Option<&'a LabelsConfig>,
+}
+
+impl Config {
+    /// Whether source rows are looked at, in any stage.
+    pub fn needs_source(&self) -> bool {
+        self.mixture.source != SourceRows::None
+            || (self.mixture.generated && (self.generator.source_states || self.generator.rows == 0))
+    }
+}
+
+/// Runs `config` on `inputs`, or takes the result from its directory under `root` if it is there.
+pub fn run(
+    name: &str,
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    place: &str,
+    device: &Device,
+) -> Result<Summary> {
+    let generated = config.mixture.generated;
+    let relabelled = config.mixture.source == SourceRows::Relabelled;
+    let spec = RunSpec {
+        inputs: inputs.spec(config.needs_source()),
+        seeds,
+        mixture: &config.mixture,
+        learner: config.learner.used(),
+        evaluation: &config.evaluation,
+        generator: generated.then_some(&config.generator),
+        filter: generated.then_some(&config.filter),
+        labels: (generated || relabelled).then_some(&config.labels),
+    };
+    let stage = Stage::open(root, &format!("{place}/{name}"), &spec)?;
+    if let Some(summary) = stage.summary::<Summary>()? {
+        eprintln!("{name}: done before, in {}", stage.directory().display());
+        return Ok(summary);
+    }
+    let started = Instant::now();
+    eprintln!("{name}: {}", stage.directory().display());
+    write_atomically(&stage.file("config.toml"), config.to_toml().as_bytes())?;
+    let mut files = vec!["config.toml".to_owned()];
+
+    let mut reports = Vec::new();
+    let mut tables = None;
+    if generated {
+        let expansion = expand(inputs, config, seeds, root, device)?;
+        for report in &expansion.reports {
+            stage.link(&expansion.stage.file(&report.file), &report.file)?;
+            files.push(report.file.clone());
+        }
+        reports = expansion.reports;
+        tables = Some(expansion.tables);
+    }
+    let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
+    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), seeds, root)?;
+    drop((tables, models));
+
+    let target = Arc::new(inputs.target.rows.clone());
+    let mut trajectories = vec![target.clone()];
+    if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
+        trajectories.push(extra[0].clone());
+    }
+    let data = |(m, &seed): (usize, &u64)| MemberData {
+        seed,
+        target: target.clone(),
+        extra: extra.as_ref().map(|e| e[m].clone()),
+        trajectories: trajectories.clone(),
+    };
+    let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
+    let arena = match (inputs.agent, inputs.shift) {
+        (Some(agent), Some(shift)) => {
+            Some(Arena { agent, shift, reference: inputs.reference(config.evaluation.scores) })
+        }
+        _ => None,
+    };
+    let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
+    drop(extra);
+    // A run that was interrupted starts its learning anew, and so do its metrics.
+    for stale in ["metrics.jsonl", "tensorboard"] {
+        let path = stage.file(stale);
+        let _ = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+    }
+    let mut metrics = Metrics::open(stage.directory())?;
+    let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, device)?;
+    for (policy, seed) in policies.iter().zip(seeds) {
+        let file = format!("policy-seed{seed}.safetensors");
+        policy.save(&stage.file(&file))?;
+        files.push(file);
+    }
+    let summary = Summary {
+        name: name.to_owned(),
+        seeds: seeds.to_vec(),
+        scores: learned.scores(),
+        learned,
+        extra_rows: extra_count,
+        generated: reports,
+        seconds: started.elapsed().as_secs_f64(),
+        directory: stage.directory().to_owned(),
+    };
+    stage.finish(&files, &summary)?;
+    Ok(summary)
+}
+
+/// `n` seeds from `first` on.
+pub fn seeds(first: u64, n: usize) -> Result<Vec<u64>> {
+    if n == 0 {
+        return Err(Error::Usage("--seeds must be at least 1".into()));
+    }
+    Ok((first..first + n as u64).collect())
+}

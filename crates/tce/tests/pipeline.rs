@@ -1,0 +1,140 @@
+//! The pipeline end to end, through the real binary, on data that the tests make themselves.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use common::{TINY, data_pair, tce, tce_json};
+use tce_data::{Agent, LoadOptions, Shift, load};
+
+/// All files under `root` that are results: data sets and policies, by name relative to it.
+fn results(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut open = vec![root.to_owned()];
+    while let Some(directory) = open.pop() {
+        for entry in fs::read_dir(&directory).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|e| e == "hdf5" || e == "safetensors") {
+                found.push((path.strip_prefix(root).unwrap().to_owned(), fs::read(&path).unwrap()));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let run = |out: &str, threads: &str| {
+        let mut args = vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og,tce-nn", "--seeds", "2"];
+        args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+        args.extend(["--out", out, "--threads", threads]);
+        args.extend(TINY);
+        tce_json(dir.path(), &args)
+    };
+    let (first, again, two) = (run("one", "1"), run("again", "1"), run("two", "2"));
+    let scores = |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
+    assert_eq!(scores(&first).len(), 5, "three floors and two variants");
+    assert_eq!(scores(&first), scores(&again));
+    assert_eq!(scores(&first), scores(&two));
+    let [a, b, c] = ["one", "again", "two"].map(|o| results(&dir.path().join(o)));
+    assert!(a.iter().any(|(p, _)| p.to_string_lossy().contains("generated-seed1")), "generated rows are kept");
+    assert!(a.iter().any(|(p, _)| p.to_string_lossy().contains("policy-seed1")), "policies are kept");
+    for ((a, b), c) in a.iter().zip(&b).zip(&c) {
+        assert_eq!((&a.0, &a.0), (&b.0, &c.0));
+        assert!(a.1 == b.1, "{} differs between two runs", a.0.display());
+        assert!(a.1 == c.1, "{} differs between one and two threads", a.0.display());
+    }
+
+    // A second call takes everything from where it is.
+    let before = fs::metadata(dir.path().join("one")).unwrap().modified().unwrap();
+    assert_eq!(scores(&run("one", "2")), scores(&first));
+    assert_eq!(fs::metadata(dir.path().join("one")).unwrap().modified().unwrap(), before);
+
+    // A result that was tampered with is noticed.
+    let policy = a.iter().find(|(p, _)| p.to_string_lossy().contains("policy-seed0")).unwrap();
+    let path = dir.path().join("one").join(&policy.0);
+    let mut bytes = policy.1.clone();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&path, bytes).unwrap();
+    let mut args = vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og,tce-nn", "--seeds", "2", "--out", "one"];
+    args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+    args.extend(TINY);
+    let output = tce(dir.path(), &args);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("changed"));
+}
+
+#[test]
+fn every_variant_runs_and_leaves_its_specification() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Kinematic);
+    let variants = "tce-ot,simple-aug,target-source,iql-swt,tce-no-filter,tce-no-reg,bc-raw";
+    let mut args = vec!["run", "hopper-kinematic:medium->medium", "--variant", variants, "--out", "out"];
+    args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+    args.extend(TINY);
+    let report = tce_json(dir.path(), &args);
+    let rows = report["rows"].as_array().unwrap();
+    assert_eq!(rows.len(), 10);
+    for row in rows {
+        assert!(row["scores"][0].is_number(), "{row}");
+        let directory = dir.path().join(row["directory"].as_str().unwrap());
+        for file in ["spec.json", "config.toml", "metrics.jsonl", "done.json", "policy-seed0.safetensors"] {
+            assert!(directory.join(file).exists(), "{} has no {file}", directory.display());
+        }
+        assert!(directory.join("tensorboard").is_dir());
+        let metrics = fs::read_to_string(directory.join("metrics.jsonl")).unwrap();
+        assert!(metrics.lines().all(|l| serde_json::from_str::<serde_json::Value>(l).is_ok()));
+    }
+    let rows_of = |variant: &str| rows.iter().find(|r| r["variant"] == variant).unwrap()["extra_rows"].as_u64().unwrap();
+    assert_eq!(rows_of("target-source"), 1500);
+    assert_eq!(rows_of("iql-swt"), 1500);
+    assert_eq!(rows_of("bc-raw"), 0);
+    assert_eq!(rows_of("tce-no-filter"), 600);
+    assert!(rows_of("tce-no-reg") < 600, "the filter rejects something");
+}
+
+#[test]
+fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::HalfCheetah, Shift::Morph);
+    let mut args = vec!["augment", "--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+    args.extend(["--out", "wide.hdf5"]);
+    args.extend(&TINY[..10]);
+    let report = tce_json(dir.path(), &args);
+    let wide = load(&dir.path().join("wide.hdf5"), &LoadOptions { columns: vec!["origin".into()], ..LoadOptions::default() }).unwrap();
+    let kept = report["generated"]["kept"].as_u64().unwrap() as usize;
+    assert_eq!(wide.transitions.len(), 600 + kept);
+    assert_eq!(wide.columns["origin"].iter().sum::<f32>() as usize, kept);
+    let original = load(&target, &LoadOptions::default()).unwrap().transitions;
+    assert_eq!(wide.transitions.observations[..original.observations.len()], original.observations);
+    assert!(wide.transitions.actions.iter().all(|a| a.abs() <= 1.0));
+
+    // An existing output is not overwritten by accident.
+    assert_eq!(tce(dir.path(), &args).status.code(), Some(2));
+
+    let mut args = vec!["learn", "--target", "target.hdf5", "--extra", "wide.hdf5", "--env", "halfcheetah-morph", "--out", "policy"];
+    args.extend(["--seeds", "2"]);
+    args.extend(&TINY[10..]);
+    let learned = tce_json(dir.path(), &args);
+    assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
+
+    let policy = "policy/policy-seed1.safetensors";
+    let evaluated = tce_json(dir.path(), &["evaluate", policy, "--env", "halfcheetah-morph", "--episodes", "2", "--seed", "1"]);
+    assert_eq!(evaluated[0]["returns"], learned["evaluations"][1]["returns"], "a saved policy acts like the learned one");
+
+    let mixture = ["collect", "--env", "halfcheetah-morph", "--actor", policy, "--actor", "policy/policy-seed0.safetensors:3"];
+    let collected = tce_json(dir.path(), &[&mixture[..], &["--rows", "500", "--lanes", "4", "--out", "c.hdf5"]].concat());
+    assert_eq!(collected["content"]["rows"], 500);
+    let checked = tce_json(dir.path(), &["data", "check", "c.hdf5", "--replay", "--env", "halfcheetah-morph"]);
+    assert_eq!(checked[0]["passes"], true, "{checked}");
+    let wrong = tce(dir.path(), &["data", "check", "c.hdf5", "--replay", "--env", "halfcheetah"]);
+    assert_eq!(wrong.status.code(), Some(1), "rows of the morphed robot do not replay in the source robot");
+    let inspected = tce_json(dir.path(), &["data", "inspect", "c.hdf5", "target.hdf5"]);
+    assert_eq!(inspected.as_array().unwrap().len(), 2);
+}
