@@ -1,5 +1,7 @@
 //! Activation functions, as a composition of burn operations and as loops the compiler vectorises.
 
+use std::mem::MaybeUninit;
+
 use burn::tensor::{Tensor, activation};
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
@@ -73,7 +75,7 @@ fn tanh(x: f32) -> f32 {
 
 /// In place on rows of width `bias.len()`: z ← z + bias, kept (where given) ← z, z ← act(z).
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(crate) fn bias_and_activation(z: &mut [f32], bias: &[f32], act: Activation, kept: Option<&mut [f32]>) {
+pub(crate) fn bias_and_activation(z: &mut [f32], bias: &[f32], act: Activation, kept: Option<&mut [MaybeUninit<f32>]>) {
     let width = bias.len();
     for row in z.chunks_exact_mut(width) {
         for (z, b) in row.iter_mut().zip(bias) {
@@ -81,7 +83,7 @@ pub(crate) fn bias_and_activation(z: &mut [f32], bias: &[f32], act: Activation, 
         }
     }
     if let Some(kept) = kept {
-        kept.copy_from_slice(z);
+        kept.write_copy_of_slice(z);
     }
     match act {
         Activation::Identity => {}
@@ -91,25 +93,25 @@ pub(crate) fn bias_and_activation(z: &mut [f32], bias: &[f32], act: Activation, 
     }
 }
 
-/// dz = dy · act'(·) and db = column sums of dz. `kept` is z for SiLU and the output y for the others.
+/// dz = dy · act'(·) where dy stands, and db = column sums of dz. `kept` is z for SiLU and the output y for the others.
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(crate) fn activation_gradient(dy: &[f32], kept: &[f32], act: Activation, dz: &mut [f32], db: &mut [f32]) {
+pub(crate) fn activation_gradient(dz: &mut [f32], kept: &[f32], act: Activation, db: &mut [f32]) {
     match act {
-        Activation::Identity => dz.copy_from_slice(dy),
+        Activation::Identity => {}
         Activation::Relu => {
-            for ((dz, dy), y) in dz.iter_mut().zip(dy).zip(kept) {
-                *dz = if *y > 0.0 { *dy } else { 0.0 };
+            for (dz, y) in dz.iter_mut().zip(kept) {
+                *dz = if *y > 0.0 { *dz } else { 0.0 };
             }
         }
         Activation::Silu => {
-            for ((dz, dy), z) in dz.iter_mut().zip(dy).zip(kept) {
+            for (dz, z) in dz.iter_mut().zip(kept) {
                 let s = sigmoid(*z);
-                *dz = dy * (s * (1.0 + z * (1.0 - s)));
+                *dz *= s * (1.0 + z * (1.0 - s));
             }
         }
         Activation::Tanh => {
-            for ((dz, dy), y) in dz.iter_mut().zip(dy).zip(kept) {
-                *dz = dy * (1.0 - y * y);
+            for (dz, y) in dz.iter_mut().zip(kept) {
+                *dz *= 1.0 - y * y;
             }
         }
     }

@@ -17,7 +17,7 @@ use burn::tensor::{DType, Shape as TensorShape, Tensor};
 use burn_flex::FlexTensor;
 
 use crate::activation::Activation;
-use crate::kernels::{self, Shape};
+use crate::kernels::{self, Shape, room, written};
 
 /// act(x W + b); see the [module](self) for the shapes.
 ///
@@ -102,12 +102,16 @@ impl Backward<Flex, 3> for DenseGradient {
     type State = Saved;
 
     fn backward(self, ops: Ops<Saved, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let dy = grads.consume::<Flex>(&ops.node).to_contiguous();
+        // The gradient of y is nobody else's: dz is computed where it stands (a shared one would be copied first).
+        let mut dy = grads.consume::<Flex>(&ops.node);
+        if !dy.is_contiguous() || dy.layout().start_offset() != 0 {
+            dy = dy.to_contiguous();
+        }
         let Saved { x, w, kept, act } = ops.state;
         let shape = shape_of(&x, &w);
         let [px, pw, pb] = ops.parents;
-        let mut dw = pw.as_ref().map(|_| vec![0.0; shape.p * shape.i * shape.o]);
-        let mut dx = px.as_ref().map(|_| vec![0.0; shape.px * shape.rows * shape.i]);
+        let mut dw = pw.as_ref().map(|_| room(shape.p * shape.i * shape.o));
+        let mut dx = px.as_ref().map(|_| room(shape.px * shape.rows * shape.i));
         let mut db = vec![0.0; shape.p * shape.o];
         kernels::backward(
             shape,
@@ -115,11 +119,13 @@ impl Backward<Flex, 3> for DenseGradient {
             slice(&w),
             act,
             slice(&kept),
-            slice(&dy),
+            &mut dy.storage_mut::<f32>()[..shape.p * shape.rows * shape.o],
             dw.as_deref_mut(),
             &mut db,
             dx.as_deref_mut(),
         );
+        // SAFETY: the backward pass has written all of them.
+        let (dw, dx) = unsafe { (dw.map(|d| written(d)), dx.map(|d| written(d))) };
         if let (Some(node), Some(dx)) = (px, dx) {
             grads.register::<Flex>(node.id, flex(dx, [shape.px, shape.rows, shape.i]));
         }
@@ -157,10 +163,11 @@ fn forward(x: &FlexTensor, w: &FlexTensor, b: &FlexTensor, act: Activation, keep
     let shape = shape_of(x, w);
     let out = [shape.p, shape.rows, shape.o];
     assert_eq!(slice(b).len(), shape.p * shape.o, "dense: one bias per output");
-    let mut y = vec![0.0; out.iter().product()];
-    let mut kept = keep.then(|| vec![0.0; y.len()]);
+    let mut y = room(out.iter().product());
+    let mut kept = keep.then(|| room(y.len()));
     kernels::forward(shape, slice(x), slice(w), slice(b), act, &mut y, kept.as_deref_mut());
-    (flex(y, out), kept.map(|k| flex(k, out)))
+    // SAFETY: the forward pass has written all of them.
+    unsafe { (flex(written(y), out), kept.map(|k| flex(written(k), out))) }
 }
 
 #[cfg(test)]

@@ -3,13 +3,14 @@
 //! Work is cut by shape, never by the number of threads, and each output element is one sequential sum: the bytes do not
 //! depend on the thread count.
 
+use std::mem::MaybeUninit;
+
 use gemm::Parallelism;
 use rayon::prelude::*;
 
 use crate::activation::{Activation, activation_gradient, bias_and_activation};
 
-/// Rows of a block: small enough that few networks feed several threads evenly, large enough that packing the other
-/// operand again for every block does not show (measured: 107 GFLOP/s on one core with and without blocks).
+/// Rows of a task where a layer is spread over threads.
 const BLOCK: usize = 128;
 /// Below this many multiply-adds a layer stays on its thread. High, because two cores that take turns at one training
 /// step fetch each other's activations and gradients from the other's cache: measured on three 256-256 networks of 256
@@ -31,9 +32,39 @@ pub(crate) struct Shape {
     pub o: usize,
 }
 
+/// Memory for results that are written before they are read: zeroing it first was a tenth of an IQL update.
+pub(crate) type Uninit = [MaybeUninit<f32>];
+
+/// Room for `n` numbers.
+pub(crate) fn room(n: usize) -> Vec<MaybeUninit<f32>> {
+    let mut out = Vec::with_capacity(n);
+    out.resize_with(n, MaybeUninit::uninit);
+    out
+}
+
+/// The numbers, all of them written.
+///
+/// # Safety
+/// Every element must have been written.
+pub(crate) unsafe fn written(room: Vec<MaybeUninit<f32>>) -> Vec<f32> {
+    let mut room = std::mem::ManuallyDrop::new(room);
+    // SAFETY: `MaybeUninit<f32>` has the layout of `f32`, and the caller has written every element.
+    unsafe { Vec::from_raw_parts(room.as_mut_ptr().cast(), room.len(), room.capacity()) }
+}
+
 impl Shape {
+    /// Whether the layer is cut into blocks of rows at all. Decided by shape alone, never by the number of threads.
+    fn large(&self) -> bool {
+        self.p * self.rows * self.i * self.o >= PARALLEL_FROM
+    }
+
     fn parallel(&self) -> bool {
-        self.p * self.rows * self.i * self.o >= PARALLEL_FROM && rayon::current_num_threads() > 1
+        self.large() && rayon::current_num_threads() > 1
+    }
+
+    /// Rows of a task when `rows` could be one: packing the other operand again for every block costs a few percent.
+    fn block(&self, rows: usize) -> usize {
+        if self.large() { BLOCK.min(rows) } else { rows }
     }
 
 }
@@ -54,21 +85,19 @@ fn transposed(data: &[f32], width: usize) -> Matrix<'_> {
     Matrix { data, row: 1, column: width }
 }
 
-/// out ← a b (+ out where `add`), with a `[m, k]`, b `[k, n]`, out `[m, n]` contiguous.
-fn product(out: &mut [f32], a: Matrix, b: Matrix, m: usize, k: usize, n: usize, add: bool) {
+/// out ← a b (+ out where `add`: then it must hold numbers), with a `[m, k]`, b `[k, n]`, out `[m, n]` contiguous.
+fn product(out: &mut Uninit, a: Matrix, b: Matrix, m: usize, k: usize, n: usize, add: bool) {
     assert_eq!(out.len(), m * n);
-    if m == 0 || n == 0 {
-        return;
-    }
     let reach = |rows: usize, columns: usize, x: &Matrix| (rows - 1) * x.row + (columns - 1) * x.column;
-    assert!(k > 0 && reach(m, k, &a) < a.data.len() && reach(k, n, &b) < b.data.len());
-    // SAFETY: the assertions above bound every element that the strides can reach.
+    assert!(m > 0 && n > 0 && k > 0 && reach(m, k, &a) < a.data.len() && reach(k, n, &b) < b.data.len());
+    // SAFETY: the assertions above bound every element that the strides can reach; without `add` all of `out` is written
+    // and none of it read.
     unsafe {
         gemm::gemm(
             m,
             n,
             k,
-            out.as_mut_ptr(),
+            out.as_mut_ptr().cast(),
             1,
             n as isize,
             add,
@@ -93,18 +122,18 @@ fn run<T: Send>(parallel: bool, tasks: Vec<T>, task: impl Fn(T) + Sync + Send) {
     if parallel { tasks.into_par_iter().for_each(task) } else { tasks.into_iter().for_each(task) }
 }
 
-/// Forward pass. `kept` receives the pre-activations, for activations whose derivative needs them.
+/// Forward pass; writes all of `y`. `kept` receives the pre-activations, for activations whose derivative needs them.
 pub(crate) fn forward(
     shape: Shape,
     x: &[f32],
     w: &[f32],
     b: &[f32],
     act: Activation,
-    y: &mut [f32],
-    kept: Option<&mut [f32]>,
+    y: &mut Uninit,
+    kept: Option<&mut Uninit>,
 ) {
     let Shape { p, px, rows, i, o } = shape;
-    let (group, block) = (p / px, BLOCK.min(rows));
+    let (group, block) = (p / px, shape.block(rows));
     let mut tasks = Vec::new();
     let mut kept_members = kept.map(|k| k.chunks_mut(rows * o));
     for (j, y_member) in y.chunks_mut(rows * o).enumerate() {
@@ -117,11 +146,14 @@ pub(crate) fn forward(
         let n = y.len() / o;
         let x = &x[(j / group * rows + c * block) * i..][..n * i];
         product(y, plain(x, i), plain(&w[j * i * o..][..i * o], o), n, i, o, false);
+        // SAFETY: the product has written all of `y`.
+        let y = unsafe { &mut *(std::ptr::from_mut(y) as *mut [f32]) };
         bias_and_activation(y, &b[j * o..][..o], act, kept);
     });
 }
 
-/// Gradients of a dense layer. `dw` and `db` may be left out for frozen weights, `dx` for inputs that need none.
+/// Gradients of a dense layer; writes all of `db`, `dw` and `dx`, and leaves dz where dy was. `dw` may be left out for
+/// frozen weights, `dx` for inputs that need none.
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn backward(
     shape: Shape,
@@ -129,22 +161,21 @@ pub(crate) fn backward(
     w: &[f32],
     act: Activation,
     kept: &[f32],
-    dy: &[f32],
-    dw: Option<&mut [f32]>,
+    dy: &mut [f32],
+    dw: Option<&mut Uninit>,
     db: &mut [f32],
-    dx: Option<&mut [f32]>,
+    dx: Option<&mut Uninit>,
 ) {
     let Shape { p, px, rows, i, o } = shape;
     let group = p / px;
     let parallel = shape.parallel();
-    let mut dz = vec![0.0; p * rows * o];
-    let tasks: Vec<_> = dz.chunks_mut(rows * o).zip(db.chunks_mut(o)).enumerate().collect();
+    let tasks: Vec<_> = dy.chunks_mut(rows * o).zip(db.chunks_mut(o)).enumerate().collect();
     run(parallel, tasks, |(j, (dz, db))| {
-        let range = j * rows * o..(j + 1) * rows * o;
-        activation_gradient(&dy[range.clone()], &kept[range], act, dz, db);
+        activation_gradient(dz, &kept[j * rows * o..][..rows * o], act, db);
     });
+    let dz: &[f32] = dy;
     if let Some(dw) = dw {
-        let block = BLOCK.min(i);
+        let block = shape.block(i);
         let mut tasks = Vec::new();
         for (j, member) in dw.chunks_mut(i * o).enumerate() {
             tasks.extend(member.chunks_mut(block * o).enumerate().map(|(c, d)| (j, c * block, d)));
@@ -157,7 +188,7 @@ pub(crate) fn backward(
         });
     }
     if let Some(dx) = dx {
-        let block = BLOCK.min(rows);
+        let block = shape.block(rows);
         let mut tasks = Vec::new();
         for (jx, member) in dx.chunks_mut(rows * i).enumerate() {
             tasks.extend(member.chunks_mut(block * i).enumerate().map(|(c, d)| (jx, c * block, d)));

@@ -129,8 +129,8 @@ impl GeneratorArgs {
             true => vec![config.generator.sampler],
             false => vec![
                 Sampler::paper(),
-                Sampler::heun(18),
-                Sampler::dpm_solver(20),
+                Sampler::Heun { steps: 18 },
+                Sampler::DpmSolver { steps: 20 },
             ],
         };
         let mut rows = Vec::new();

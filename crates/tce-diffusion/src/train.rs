@@ -1,0 +1,300 @@
+//! Training by denoising score matching (B.2, B.6): Adam on ‖F − target‖², one set of tensors for the whole population.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_base::random::fill_normal;
+use tce_base::{Progress, Streams, interrupted};
+use tce_nn::{
+    Adam, AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, cosine_decay, host, moving_average, tensor,
+};
+
+use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
+
+/// Steps between two reports of the loss.
+const REPORT: u64 = 100;
+
+/// How to train.
+///
+/// | symbol | field | default | source |
+/// |---|---|---|---|
+/// | – | `learning_rate` | 1e-4 | Table C.4 |
+/// | – | `schedule` | `constant` | Table C.4 names none |
+/// | B | `batch` | 128 | Table C.4 |
+/// | – | `ema` | 0.999 | own; rate of the average that samples, warmed up as min(ema, (1 + t) / (10 + t)); 0: none |
+///
+/// An epoch of the paper is read as a pass over the target rows (39 batches of 128 for 5 000 rows): 10K epochs of the
+/// state score network are 390 000 steps, 5K of the transition score network 195 000.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Of Adam.
+    pub learning_rate: f64,
+    /// Over the steps of the training.
+    pub schedule: Schedule,
+    /// Rows per step and member.
+    pub batch: usize,
+    /// What the moving average keeps per step.
+    pub ema: f64,
+}
+
+/// The learning rate over the steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// The same at every step.
+    #[default]
+    Constant,
+    /// Along a half cosine to zero.
+    Cosine,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self { learning_rate: 1e-4, schedule: Schedule::Constant, batch: 128, ema: 0.999 }
+    }
+}
+
+impl TrainConfig {
+    fn check(&self) -> Result<(), DiffusionError> {
+        if !(self.learning_rate > 0.0 && self.learning_rate.is_finite()) {
+            return Err(DiffusionError::input("train.learning_rate", self.learning_rate, "a positive number"));
+        }
+        if self.batch == 0 {
+            return Err(DiffusionError::input("train.batch", 0, "at least 1"));
+        }
+        if !(0.0..1.0).contains(&self.ema) {
+            return Err(DiffusionError::input("train.ema", self.ema, "at least 0 and less than 1"));
+        }
+        Ok(())
+    }
+}
+
+/// A noisy batch of the whole population.
+struct Batch {
+    /// c_in x^τ `[P, B, d]`
+    x: Tensor<3>,
+    /// c_noise `[P, B, 1]`
+    time: Tensor<3>,
+    /// `[P, B, c]`
+    condition: Tensor<3>,
+    /// `[P, B, d]`
+    target: Tensor<3>,
+}
+
+/// A training under way.
+pub struct Trainer {
+    name: String,
+    spec: NetworkConfig,
+    process: Process,
+    config: TrainConfig,
+    members: Vec<Streams>,
+    device: Device,
+    network: ScoreNetwork,
+    average: Option<ScoreNetwork>,
+    adam: Adam,
+    step: u64,
+}
+
+impl Trainer {
+    /// A fresh population, one network per member; `name` tells its random streams (`init/{name}/…`, `train/{name}`)
+    /// and its progress bar from those of other trainings. `device` is a plain device (no autodiff).
+    ///
+    /// # Errors
+    /// If a setting is unusable.
+    pub fn new(
+        name: &str,
+        spec: NetworkConfig,
+        process: Process,
+        config: TrainConfig,
+        members: &[Streams],
+        device: &Device,
+    ) -> Result<Self, DiffusionError> {
+        spec.check()?;
+        process.check()?;
+        config.check()?;
+        if members.is_empty() {
+            return Err(DiffusionError::input("members", 0, "at least 1"));
+        }
+        let device = device.clone().autodiff();
+        let network = spec.init(members, name, &device);
+        let average = (config.ema > 0.0).then(|| network.valid());
+        let adam = AdamConfig::default().init();
+        let (name, members) = (name.to_owned(), members.to_vec());
+        Ok(Self { name, spec, process, config, members, device, network, average, adam, step: 0 })
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Trains until `steps` steps are taken (since the beginning, not since the last call). `data` is one set for all
+    /// members, or one per member. `on_loss` gets the steps taken and each member's mean loss since the last report, every
+    /// 100 steps and at the end; a loss is the mean over rows and dimensions, 1 for a network that knows nothing of VE's
+    /// or VP's noise.
+    ///
+    /// # Errors
+    /// If the data does not fit the network, the loss is no number any more, or the user interrupts; then the trainer is
+    /// whole, and [`Trainer::state`] can be kept.
+    pub fn train(
+        &mut self,
+        data: &[ScoreData],
+        steps: u64,
+        mut on_loss: impl FnMut(u64, &[f32]),
+    ) -> Result<(), DiffusionError> {
+        self.check_data(data)?;
+        let progress = Progress::new(format!("train {}", self.name), steps.saturating_sub(self.step), "steps");
+        let (mut sum, mut count) = (None, 0u64);
+        while self.step < steps {
+            if interrupted() {
+                let label = format!("training of {}", self.name);
+                return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
+            }
+            let loss = self.step(data, steps);
+            sum = Some(match sum {
+                None => loss,
+                Some(sum) => sum + loss,
+            });
+            count += 1;
+            progress.inc(1);
+            if self.step.is_multiple_of(REPORT) || self.step == steps {
+                let losses =
+                    host(sum.take().expect("at least one step")).iter().map(|l| l / count as f32).collect::<Vec<_>>();
+                count = 0;
+                if let Some(member) = losses.iter().position(|l| !l.is_finite()) {
+                    let (label, loss) = (format!("training of {}", self.name), losses[member]);
+                    let (step, learning_rate) = (self.step, self.config.learning_rate);
+                    return Err(DiffusionError::Diverged { label, member, loss, step, learning_rate });
+                }
+                progress.message(format!("loss {:.4}", losses.iter().sum::<f32>() / losses.len() as f32));
+                on_loss(self.step, &losses);
+            }
+        }
+        progress.finish();
+        Ok(())
+    }
+
+    fn check_data(&self, data: &[ScoreData]) -> Result<(), DiffusionError> {
+        if data.len() != 1 && data.len() != self.members.len() {
+            return Err(DiffusionError::input("data sets", data.len(), format!("1, or {}", self.members.len())));
+        }
+        for d in data {
+            let (found, expected) = ((d.dims(), d.condition()), (self.spec.dims, self.spec.condition));
+            if found != expected {
+                let text = |(d, c): (usize, usize)| format!("rows of {d} under conditions of {c}");
+                return Err(DiffusionError::input(format!("data of {}", self.name), text(found), text(expected)));
+            }
+        }
+        Ok(())
+    }
+
+    /// One step of Adam; the loss of each member, `[P, 1, 1]`.
+    fn step(&mut self, data: &[ScoreData], steps: u64) -> Tensor<3> {
+        let loss = denoising_loss(&self.network, self.batch(data));
+        let detached = loss.clone().inner();
+        let mut grads = loss.sum().backward();
+        let rate = match self.config.schedule {
+            Schedule::Constant => self.config.learning_rate,
+            Schedule::Cosine => cosine_decay(self.config.learning_rate, self.step, steps),
+        };
+        self.network = self.adam.step(rate, self.network.clone(), &mut grads);
+        if let Some(average) = self.average.take() {
+            let t = self.step as f64;
+            let keep = self.config.ema.min((1.0 + t) / (10.0 + t));
+            self.average = Some(moving_average(average, &self.network, 1.0 - keep));
+        }
+        self.step += 1;
+        detached
+    }
+
+    /// The batch of the next step. Its streams are indexed by the step: a restored training continues the same draws.
+    fn batch(&self, data: &[ScoreData]) -> Batch {
+        let (p, b, d, c) = (self.members.len(), self.config.batch, self.spec.dims, self.spec.condition);
+        let (mut x, mut target) = (Vec::with_capacity(p * b * d), Vec::with_capacity(p * b * d));
+        let (mut time, mut condition) = (Vec::with_capacity(p * b), Vec::with_capacity(p * b * c));
+        let mut z = vec![0.0; d];
+        for (m, streams) in self.members.iter().enumerate() {
+            let data = &data[if data.len() == 1 { 0 } else { m }];
+            let mut rng = streams.indexed(&format!("train/{}", self.name), self.step);
+            for i in 0..b {
+                let (row, on) = data.draw(&mut rng, i);
+                let level = self.process.draw(&mut rng);
+                fill_normal(&mut rng, &mut z);
+                let pre = self.process.precondition(level);
+                let (of_row, of_noise) = self.process.network_target(level);
+                let (alpha, sigma) = ((pre.scale * level.alpha) as f32, (pre.scale * level.sigma) as f32);
+                x.extend(row.iter().zip(&z).map(|(x, z)| alpha * x + sigma * z));
+                let (of_row, of_noise) = (of_row as f32, of_noise as f32);
+                target.extend(row.iter().zip(&z).map(|(x, z)| of_row * x + of_noise * z));
+                time.push(pre.time as f32);
+                condition.extend_from_slice(on);
+            }
+        }
+        let tensor = |data, width| tensor(data, [p, b, width], &self.device);
+        Batch { x: tensor(x, d), time: tensor(time, 1), condition: tensor(condition, c), target: tensor(target, d) }
+    }
+
+    /// The model as it is: the moving average if there is one.
+    pub fn model(&self) -> ScoreModel {
+        let network = self.average.clone().unwrap_or_else(|| self.network.valid());
+        ScoreModel::new(self.spec, self.process, network)
+    }
+
+    /// Everything a continuation needs besides the arguments of [`Trainer::new`].
+    pub fn state(&self) -> NamedParameters {
+        let mut out = NamedParameters::default();
+        out.collect("network", &self.network);
+        if let Some(average) = &self.average {
+            out.collect("average", average);
+        }
+        for (i, (m, v)) in self.adam.state().1.iter().enumerate() {
+            for (name, t) in [("m", m), ("v", v)] {
+                out.tensors.insert(format!("adam.{name}.{i}"), (t.dims().to_vec(), host(t.clone())));
+            }
+        }
+        out.metadata = BTreeMap::from([("step".to_owned(), self.step.to_string())]);
+        out
+    }
+
+    /// Puts back what [`Trainer::state`] gave; the rest of the training gives the same bytes as one without a break.
+    /// `path` is where it came from, for messages.
+    ///
+    /// # Errors
+    /// If the state belongs to another training.
+    pub fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), DiffusionError> {
+        let format = |reason: &str| NetworkError::Format { path: path.to_owned(), reason: reason.to_owned() };
+        let step = state.metadata.get("step").and_then(|s| s.parse().ok());
+        let step: u64 = step.ok_or_else(|| format("the metadata has no 'step': no state of a training"))?;
+        let network = state.apply("network", self.network.clone(), path)?;
+        let average = self.average.clone().map(|a| state.apply("average", a, path)).transpose()?;
+        let plain = self.device.clone().inner();
+        let mut moments = Vec::new();
+        let moment = |name: &str, i: usize| {
+            let (shape, data) = state.tensors.get(&format!("adam.{name}.{i}"))?;
+            let flat = tensor(data.clone(), [1, 1, data.len()], &plain);
+            (shape.len() == 1).then(|| flat.reshape([data.len()]))
+        };
+        while let (Some(m), Some(v)) = (moment("m", moments.len()), moment("v", moments.len())) {
+            moments.push((m, v));
+        }
+        let wanted = state.tensors.keys().filter(|k| k.starts_with("network.")).count();
+        if step > 0 && moments.len() != wanted {
+            return Err(format("the optimiser's moments are missing").into());
+        }
+        self.adam.restore(step as i32, moments);
+        (self.network, self.average, self.step) = (network, average, step);
+        Ok(())
+    }
+}
+
+/// The mean over rows and dimensions of (F − target)², per member: `[P, 1, 1]`. Members are summed, not averaged, before
+/// the backward pass, so that each gets the gradient it would get alone.
+fn denoising_loss(network: &ScoreNetwork, batch: Batch) -> Tensor<3> {
+    let f = network.forward(batch.x, batch.time, batch.condition);
+    (f - batch.target).square().mean_dim(2).mean_dim(1)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,306 @@
+//! Implicit Q-learning (Kostrikov et al. 2022), in the form that OTDF and ODRL train and TCE names.
+//!
+//! ```text
+//! u   = min(Q1', Q2')(s, a) - V(s)                                   before V's step
+//! L_V = mean of |τ - 1[u < 0]| u²                                    (B.12)       → V
+//! y   = r + γ (1 - terminal) V(s')                                   V after its step
+//! L_Q = mean (Q1(s, a) - y)² + mean (Q2(s, a) - y)²                  (B.13)       → Q1, Q2
+//! Q'  ← (1 - ρ) Q' + ρ Q
+//! w   = min(exp(β u), cap)
+//! L_π = mean of w ℓ(s, a) + β_reg · regulariser                      (10, B.14)   → π
+//! ```
+//!
+//! ℓ = -log π (see [`crate::actor`]); B.14 prints + log π where it must be minus. Each row's weight multiplies that row's
+//! own ℓ; OTDF's and DmC's code multiplies a column of weights with a row of losses, which clones every action with the
+//! mean weight: that is `mean_weight` here.
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | τ | `expectile` | .7 | B.2 |
+//! | β | `temperature` | 3 | B.2 |
+//! | cap | `weight_cap` | 100 | IQL's authors, OTDF |
+//! | γ | `discount` | .99 | OTDF, IQL |
+//! | ρ | `polyak` | .005 | OTDF, IQL |
+//! | - | `critic_lr` | 3e-4 | Table C.4 |
+//! | - | `hidden` | 256, 256 ReLU | OTDF, IQL |
+//! | - | `actor` | see [`crate::actor`] | OTDF |
+//! | - | `policy_extraction` | awr_mse | OTDF as meant; awr_logprob: IQL's authors; mean_weight: OTDF as coded |
+//! | - | `advantage` | raw | as published; standardised: u / its standard deviation over the batch |
+//! | - | `reward_scale` | none | OTDF; return_range: IQL's authors. Applied by the buffer ([`crate::return_range_scale`]) |
+//! | β_reg | `beta_reg` | .001 | Table C.5, most tasks |
+//! | - | `regulariser` | none | forward_kl: Eq. 10; otdf: OTDF; see [`crate::regulariser`] |
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, Mlp, MlpConfig, NamedParameters, NetworkError, Tensor, host};
+
+use crate::actor::{Actor, ActorConfig, PolicyForm};
+use crate::buffer::{Buffer, Minibatch, RewardScale};
+use crate::error::{LearnError, within};
+use crate::losses::{
+    AdvantageScale, AdvantageWeights, advantage_weights, expectile_loss, member_mean, twin_min, twin_squared_error,
+};
+use crate::policy::Policy;
+use crate::regulariser::{Regulariser, RegulariserKind};
+use crate::training::{Averaged, Learner, Meter, PolicyLearner, Trained};
+
+/// A weight below this does not move a policy.
+const DEAD_WEIGHT: f32 = 0.01;
+
+/// How the critics' advantages reach the policy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PolicyExtraction {
+    /// Weighted squared error of a deterministic policy (or of a tanh-Gaussian's mean).
+    #[default]
+    AwrMse,
+    /// Weighted log-likelihood of a normal policy with a standard deviation per action dimension.
+    AwrLogprob,
+    /// As `awr_mse`, every row with the mean weight of its batch: what OTDF's code does.
+    MeanWeight,
+}
+
+/// The configuration of [`Iql`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct IqlConfig {
+    /// τ
+    pub expectile: f64,
+    /// β
+    pub temperature: f64,
+    /// Greatest weight of a row.
+    pub weight_cap: f64,
+    /// γ
+    pub discount: f64,
+    /// ρ
+    pub polyak: f64,
+    /// Learning rate of V and Q, constant.
+    pub critic_lr: f64,
+    /// Hidden layers of V and Q.
+    pub hidden: Vec<usize>,
+    /// The policy; its `form` follows from `policy_extraction` and `regulariser`.
+    pub actor: ActorConfig,
+    /// From advantages to a policy.
+    pub policy_extraction: PolicyExtraction,
+    /// Units of the advantage.
+    pub advantage: AdvantageScale,
+    /// Scale of the rewards; whoever makes the buffer applies it.
+    pub reward_scale: RewardScale,
+    /// β_reg
+    pub beta_reg: f64,
+    /// What keeps the policy near the target's behaviour.
+    pub regulariser: RegulariserKind,
+}
+
+impl Default for IqlConfig {
+    fn default() -> Self {
+        Self {
+            expectile: 0.7,
+            temperature: 3.0,
+            weight_cap: 100.0,
+            discount: 0.99,
+            polyak: 0.005,
+            critic_lr: 3e-4,
+            hidden: vec![256, 256],
+            actor: ActorConfig::default(),
+            policy_extraction: PolicyExtraction::default(),
+            advantage: AdvantageScale::default(),
+            reward_scale: RewardScale::default(),
+            beta_reg: 1e-3,
+            regulariser: RegulariserKind::default(),
+        }
+    }
+}
+
+impl IqlConfig {
+    /// Refuses numbers out of range, and combinations that cannot be trained.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("expectile", self.expectile, 0.0..=1.0)?;
+        within("temperature", self.temperature, 0.0..=1e6)?;
+        within("weight_cap", self.weight_cap, f64::MIN_POSITIVE..=1e30)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("polyak", self.polyak, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        within("beta_reg", self.beta_reg, 0.0..=1e6)?;
+        if self.regulariser == RegulariserKind::Otdf && self.policy_extraction == PolicyExtraction::AwrLogprob {
+            let remedy = "choose awr_mse or mean_weight, or another regulariser";
+            return Err(LearnError::invalid(
+                "policy_extraction",
+                "awr_logprob",
+                "a tanh-Gaussian policy for OTDF",
+                remedy,
+            ));
+        }
+        Ok(())
+    }
+
+    fn form(&self) -> PolicyForm {
+        match (self.policy_extraction, self.regulariser) {
+            (PolicyExtraction::AwrLogprob, _) => PolicyForm::Gaussian,
+            (_, RegulariserKind::Otdf) => PolicyForm::TanhGaussian,
+            _ => PolicyForm::TanhMean,
+        }
+    }
+}
+
+/// IQL of a population.
+pub struct Iql {
+    config: IqlConfig,
+    actor: Actor,
+    /// `[P, ...]`
+    value: Trained<Mlp>,
+    /// `[2P, ...]`: critics 2m and 2m + 1 are the twins of member m.
+    critic: Trained<Mlp>,
+    target: Averaged<Mlp>,
+    regulariser: Regulariser,
+}
+
+impl Iql {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used, or `regulariser` is not of the kind it names.
+    pub fn new(
+        buffer: &Buffer,
+        config: &IqlConfig,
+        regulariser: Regulariser,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
+        config.check()?;
+        if regulariser.kind() != config.regulariser {
+            let (found, expected) = (format!("{:?}", regulariser.kind()), format!("{:?}", config.regulariser));
+            return Err(LearnError::invalid("regulariser", found, expected, "make it with Regulariser::prepare"));
+        }
+        let actor = ActorConfig { form: config.form(), ..config.actor.clone() };
+        let actor = Actor::new(buffer, &actor, steps, device)?;
+        let (members, device) = (buffer.streams(), device.clone().autodiff());
+        let inputs = buffer.inputs().len();
+        let value = MlpConfig::relu(inputs, &config.hidden, 1).init(&members, "value", &device);
+        let critic = twins(&MlpConfig::relu(inputs + buffer.act_dim(), &config.hidden, 1), &members, &device);
+        Ok(Self {
+            config: config.clone(),
+            actor,
+            value: Trained::new(value),
+            target: Averaged::new(&critic),
+            critic: Trained::new(critic),
+            regulariser,
+        })
+    }
+
+    /// One update of all networks. `critic_weights` `[P, B, 1]` multiply the rows of L_Q.
+    pub fn step(&mut self, batch: &Minibatch, critic_weights: Option<Tensor<3>>, step: u64, meter: &mut Meter) {
+        let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
+        let u = self.value_step(batch, &sa, meter);
+        self.critic_step(batch, sa, critic_weights, meter);
+        self.policy_step(batch, u, step, meter);
+    }
+
+    /// L_V. Returns u of before the step.
+    fn value_step(&mut self, batch: &Minibatch, sa: &Tensor<3>, meter: &mut Meter) -> Tensor<3> {
+        let q = twin_min(self.target.net().forward(sa.clone()));
+        let v = self.value.net().forward(batch.s.clone());
+        if meter.active() {
+            meter.record("value_magnitude", &v.clone().inner().abs());
+        }
+        let difference = q - v;
+        let u = difference.clone().inner();
+        let loss = expectile_loss(difference, self.config.expectile);
+        meter.record("value_loss", &loss);
+        self.value.step(loss.sum(), self.config.critic_lr);
+        u
+    }
+
+    /// L_Q and the moving average.
+    fn critic_step(&mut self, batch: &Minibatch, sa: Tensor<3>, weights: Option<Tensor<3>>, meter: &mut Meter) {
+        let next = self.value.net().forward(batch.s2.clone()).inner();
+        let y = batch.r.clone() + batch.not_done.clone() * next * self.config.discount;
+        let loss = twin_squared_error(self.critic.net().forward(sa), y, weights);
+        meter.record("critic_loss", &loss);
+        self.critic.step(loss.sum(), self.config.critic_lr);
+        self.target.follow(self.critic.net(), self.config.polyak);
+    }
+
+    /// L_π.
+    fn policy_step(&mut self, batch: &Minibatch, u: Tensor<3>, step: u64, meter: &mut Meter) {
+        let c = &self.config;
+        let weights = AdvantageWeights { temperature: c.temperature, cap: c.weight_cap, scale: c.advantage };
+        let mut w = advantage_weights(u.clone(), weights);
+        if meter.active() {
+            let members = w.dims()[0];
+            let rows = w.dims()[1] as f64;
+            let (values, cap) = (host(w.clone()), c.weight_cap as f32);
+            let share = |test: &dyn Fn(f32) -> bool| -> Vec<f64> {
+                let count = |of: &[f32]| of.iter().filter(|&&w| test(w)).count() as f64 / rows;
+                values.chunks(values.len() / members).map(count).collect()
+            };
+            meter.add("weight_capped", share(&|w| w >= cap));
+            meter.add("weight_dead", share(&|w| w < DEAD_WEIGHT));
+            meter.record("weight_mean", &w);
+            meter.record("advantage_mean", &u);
+            let deviation = u.clone() - u.mean_dim(1);
+            meter.record("advantage_std", &deviation.square().mean_dim(1).sqrt());
+        }
+        if c.policy_extraction == PolicyExtraction::MeanWeight {
+            w = member_mean(w);
+        }
+        let output = self.actor.forward(batch.s.clone());
+        let mut loss = self.actor.imitation_loss(&output, batch.a.clone(), Some(w));
+        meter.record("policy_loss", &loss);
+        if c.beta_reg > 0.0
+            && let Some(term) = self.regulariser.loss(&self.actor, &output, batch, step)
+        {
+            meter.record("regulariser", &term);
+            loss = loss + term * c.beta_reg;
+        }
+        drop(output);
+        self.actor.step(loss, step);
+    }
+}
+
+/// Two networks per member, side by side.
+pub fn twins(config: &MlpConfig, members: &[tce_base::Streams], device: &Device) -> Mlp {
+    let pair = |name| config.init(members, name, device);
+    let (mut one, two) = (pair("critic 1"), pair("critic 2"));
+    for (a, b) in one.layers.iter_mut().zip(two.layers) {
+        for (a, b) in [(&mut a.weight, b.weight), (&mut a.bias, b.bias)] {
+            let [p, rows, columns] = b.val().dims();
+            let side = |t: Tensor<3>| t.inner().reshape([p, 1, rows, columns]);
+            let both = Tensor::cat(vec![side(a.val()), side(b.val())], 1).reshape([2 * p, rows, columns]);
+            *a = tce_nn::burn::module::Param::from_tensor(both.autodiff());
+        }
+    }
+    one
+}
+
+impl Learner for Iql {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        self.step(batch, None, step, meter);
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.actor.save(&mut state);
+        self.value.save("value", &mut state);
+        self.critic.save("critic", &mut state);
+        state.collect("target", self.target.net());
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.actor.load(state, path)?;
+        self.value.load("value", state, path)?;
+        self.critic.load("critic", state, path)?;
+        self.target.load("target", state, path)
+    }
+}
+
+impl PolicyLearner for Iql {
+    fn policies(&self) -> Vec<Policy> {
+        self.actor.policies()
+    }
+}
