@@ -37,7 +37,14 @@ impl Progress {
             bar
         });
         let now = Instant::now();
-        Self { label, unit, total, bar, started: now, plain: Mutex::new(Plain { done: 0, last: now, message: String::new() }) }
+        Self {
+            label,
+            unit,
+            total,
+            bar,
+            started: now,
+            plain: Mutex::new(Plain { done: 0, last: now, message: String::new() }),
+        }
     }
 
     /// Reports that `n` more units are done.
@@ -55,7 +62,13 @@ impl Progress {
             let left = self.total.saturating_sub(plain.done) as f64 / rate.max(1e-9);
             eprintln!(
                 "{}: {}/{} {} ({:.0}/s, {} left) {}",
-                self.label, plain.done, self.total, self.unit, rate, duration(left), plain.message
+                self.label,
+                plain.done,
+                self.total,
+                self.unit,
+                rate,
+                duration(left),
+                plain.message
             );
         }
     }

@@ -1,4 +1,4 @@
-//! Measures learners: `cargo run --release -p tce-learn --example updates_per_second [MEMBERS] [STEPS] [bc|iql]`.
+//! Measures learners: `cargo run --release -p tce-learn --example updates_per_second [MEMBERS] [STEPS] [bc|iql|act]`.
 //! HalfCheetah's shape: 17 observations, 6 actions, 128 + 128 rows, 256-256 networks.
 
 use std::convert::Infallible;
@@ -9,7 +9,7 @@ use tce_base::{Streams, random::fill_normal};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::iql::{Iql, IqlConfig};
 use tce_learn::regulariser::Regulariser;
-use tce_learn::{Bc, BcConfig, Buffer, Learner, Member, Steps, train};
+use tce_learn::{Bc, BcConfig, Buffer, Learner, Member, PolicyLearner, Steps, train};
 use tce_nn::cpu;
 
 fn table(seed: u64, rows: usize) -> Arc<Transitions> {
@@ -30,6 +30,17 @@ fn table(seed: u64, rows: usize) -> Arc<Transitions> {
     Arc::new(t)
 }
 
+/// Microseconds per call of a policy, as evaluation uses it.
+fn act(buffer: &Buffer, calls: u64) {
+    let policy = Bc::new(buffer, &BcConfig::default(), 1, &cpu()).expect("defaults").policies().remove(0);
+    for rows in [1, 10, 64] {
+        let (observations, mut actions) = (vec![0.5; rows * 17], vec![0.0; rows * 6]);
+        let begin = Instant::now();
+        (0..calls).for_each(|_| policy.act(&observations, None, &mut actions));
+        println!("{rows} rows: {:.1} µs per call", begin.elapsed().as_secs_f64() * 1e6 / calls as f64);
+    }
+}
+
 fn main() {
     let argument = |k: usize, default: &str| std::env::args().nth(k).unwrap_or_else(|| default.into());
     let members: u64 = argument(1, "1").parse().expect("a number of members");
@@ -42,6 +53,9 @@ fn main() {
         reward_scale: 1.0,
     };
     let buffer = Buffer::new((0..members).map(member).collect(), 256).expect("good data");
+    if argument(3, "iql") == "act" {
+        return act(&buffer, steps);
+    }
     let mut learner: Box<dyn Learner> = match argument(3, "iql").as_str() {
         "bc" => Box::new(Bc::new(&buffer, &BcConfig::default(), steps, &cpu()).expect("defaults")),
         _ => Box::new(Iql::new(&buffer, &IqlConfig::default(), Regulariser::None, steps, &cpu()).expect("defaults")),

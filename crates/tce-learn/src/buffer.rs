@@ -26,7 +26,8 @@ pub struct Member {
     pub streams: Streams,
     /// The data sets, the target's first. Members may share them.
     pub parts: Vec<Arc<Transitions>>,
-    /// How observations reach the networks; [`Standardizer::identity`] for raw ones.
+    /// How observations reach the networks; [`Standardizer::identity`] for raw ones. Its `dead` dimensions are not
+    /// shown to the networks if they are dead for every member, so a raw member may name them too.
     pub standardizer: Standardizer,
     /// Factor on every reward; 1 for none, see [`return_range_scale`].
     pub reward_scale: f32,

@@ -186,3 +186,49 @@ fn behaviour_log_density(
     let greatest = log_prob.clone().inner().max_dim(2);
     (log_prob - greatest.clone()).exp().sum_dim(2).log() + greatest
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::buffer::Member;
+    use crate::cvae::CvaeLearner;
+    use std::path::Path;
+    use std::sync::Arc;
+    use tce_data::{Standardizer, Transitions};
+    use tce_nn::{NamedParameters, cpu, host};
+
+    /// With a decoder that ignores z, all K terms are the same normal density around its output.
+    #[test]
+    fn the_behaviour_density_follows_its_formula() {
+        let mut t = Transitions::new(2, 1);
+        t.push(&[0.0, 1.0], &[0.5], 0.0, &[0.0, 0.0], false, true);
+        let member = Member {
+            streams: Streams::new(1),
+            parts: vec![Arc::new(t)],
+            standardizer: Standardizer::identity(2),
+            reward_scale: 1.0,
+        };
+        let buffer = Buffer::new(vec![member], 1).unwrap();
+        let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::default() };
+        let cvae = CvaeLearner::new(&buffer, &config, &cpu()).unwrap().model();
+        let mut weights = NamedParameters::default();
+        weights.collect("cvae", &cvae);
+        let first = weights.tensors.get_mut("cvae.decoder.layers.0.weight").unwrap();
+        assert_eq!(first.0, [1, 4, 8]);
+        first.1[2 * 8..].fill(0.0);
+        let cvae = weights.apply("cvae", cvae, Path::new("test")).unwrap();
+
+        let s = tensor(vec![0.3, -0.4, 1.0, 2.0], [1, 2, 2], &cpu());
+        let a = tensor(vec![0.2, -0.9], [1, 2, 1], &cpu().autodiff()).require_grad();
+        let mean = host(cvae.decode(s.clone(), Tensor::zeros([1, 2, 2], &cpu())));
+        let density = behaviour_log_density(&cvae, s, a.clone(), 5, 0.5, &buffer.streams(), 3);
+        let grads = density.clone().sum().backward();
+        let (density, gradient) = (host(density), host(a.grad(&grads).unwrap()));
+        for (i, a) in [0.2f32, -0.9].into_iter().enumerate() {
+            let z = (a - mean[i]) / 0.5;
+            let expected = 5f32.ln() - 0.5 * z * z - 0.5f32.ln() - 0.5 * (2.0 * std::f32::consts::PI).ln();
+            assert!((density[i] - expected).abs() < 1e-4, "{} is not {expected}", density[i]);
+            assert!((gradient[i] + z / 0.5).abs() < 1e-4);
+        }
+    }
+}

@@ -11,7 +11,8 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, Learner, Member, Policy, PolicyLearner, Steps, best_trajectories, train,
+    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, Learner, Member, Policy, PolicyLearner, Steps, best_trajectories,
+    train, train_labels,
 };
 use tce_nn::cpu;
 
@@ -81,6 +82,24 @@ fn a_member_equals_a_run_of_its_own_and_a_repetition_equals_itself() {
     }
     let (a, b) = (action(&all[1], &[0.3, 5.002]), action(&one[0], &[0.3, 5.002]));
     assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-4), "{a:?} {b:?}");
+}
+
+#[test]
+fn the_bytes_do_not_depend_on_the_number_of_threads() {
+    let data = linear_data();
+    let members: Vec<_> = (1..3).map(|seed| member(seed, &data, true)).collect();
+    let learn = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let buffer = Buffer::new(members.clone(), 256).unwrap();
+            let mut iql = Iql::new(&buffer, &IqlConfig::default(), Regulariser::None, 3, &cpu()).unwrap();
+            run(&mut iql, &buffer, 3);
+            let labels = LabelConfig { steps: 3, learn_terminals: true, ..LabelConfig::default() };
+            let labels = train_labels(&members, &labels, &cpu()).unwrap().unwrap();
+            (iql.state().to_bytes(), labels.state().to_bytes())
+        })
+    };
+    assert!(learn(1) == learn(2), "another number of threads gave other parameters");
 }
 
 #[test]

@@ -135,13 +135,7 @@ fn update(
     let primitive = |t: Tensor<1>| t.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff");
     let (mut theta, g, mut m, mut v) = (primitive(theta), primitive(g), primitive(m), primitive(v));
     let g = g.to_contiguous();
-    fused(
-        theta.storage_mut(),
-        g.as_slice().expect("contiguous"),
-        m.storage_mut(),
-        v.storage_mut(),
-        c,
-    );
+    fused(theta.storage_mut(), g.as_slice().expect("contiguous"), m.storage_mut(), v.storage_mut(), c);
     let tensor = Tensor::from_primitive::<Flex>;
     (tensor(theta), tensor(m), tensor(v))
 }

@@ -38,11 +38,7 @@ pub fn dense(x: Tensor<3>, w: Tensor<3>, b: Tensor<3>, act: Activation) -> Tenso
 /// The definition of [`dense`] in burn's own operations: the path of every device but the CPU, and the oracle in tests.
 pub fn dense_composed(x: Tensor<3>, w: Tensor<3>, b: Tensor<3>, act: Activation) -> Tensor<3> {
     let ([px, rows, i], p) = (x.dims(), w.dims()[0]);
-    let x = if px == p {
-        x
-    } else {
-        x.reshape([px, 1, rows, i]).expand([px, p / px, rows, i]).reshape([p, rows, i])
-    };
+    let x = if px == p { x } else { x.reshape([px, 1, rows, i]).expand([px, p / px, rows, i]).reshape([p, rows, i]) };
     act.compose(x.matmul(w) + b)
 }
 
@@ -55,12 +51,7 @@ pub(crate) fn is_flex<const D: usize>(t: &Tensor<D>) -> bool {
 #[backend_extension(Flex, Autodiff)]
 pub trait DenseBackend: Backend {
     /// See [`dense`](crate::dense).
-    fn dense(
-        x: FloatTensor<Self>,
-        w: FloatTensor<Self>,
-        b: FloatTensor<Self>,
-        act: Activation,
-    ) -> FloatTensor<Self>;
+    fn dense(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>, act: Activation) -> FloatTensor<Self>;
 }
 
 impl DenseBackend for Flex {
@@ -159,7 +150,13 @@ fn shape_of(x: &FlexTensor, w: &FlexTensor) -> Shape {
 }
 
 /// y and, where wanted, z.
-fn forward(x: &FlexTensor, w: &FlexTensor, b: &FlexTensor, act: Activation, keep: bool) -> (FlexTensor, Option<FlexTensor>) {
+fn forward(
+    x: &FlexTensor,
+    w: &FlexTensor,
+    b: &FlexTensor,
+    act: Activation,
+    keep: bool,
+) -> (FlexTensor, Option<FlexTensor>) {
     let shape = shape_of(x, w);
     let out = [shape.p, shape.rows, shape.o];
     assert_eq!(slice(b).len(), shape.p * shape.o, "dense: one bias per output");

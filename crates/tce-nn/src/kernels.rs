@@ -66,7 +66,6 @@ impl Shape {
     fn block(&self, rows: usize) -> usize {
         if self.large() { BLOCK.min(rows) } else { rows }
     }
-
 }
 
 /// A matrix in memory: first element, and the distance between rows and between columns.

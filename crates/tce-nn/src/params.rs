@@ -93,7 +93,9 @@ impl NamedParameters {
             0 => None,
             // A hash map has no order: more than one entry would make the bytes depend on chance.
             1 => Some(self.metadata.clone().into_iter().collect()),
-            _ => Some(HashMap::from([("tce".to_owned(), serde_json::to_string(&self.metadata).expect("plain strings"))])),
+            _ => {
+                Some(HashMap::from([("tce".to_owned(), serde_json::to_string(&self.metadata).expect("plain strings"))]))
+            }
         };
         safetensors::serialize(views, metadata).expect("names and shapes are valid")
     }
@@ -286,7 +288,10 @@ mod tests {
         saved.collect("n", &network(&[1], &cpu()));
         let other = MlpConfig::relu(3, &[5], 2).init(&[Streams::new(0)], "n", &cpu());
         let error = saved.apply("n", other, Path::new("n.safetensors")).unwrap_err().to_string();
-        assert!(error.contains("n.layers.0.weight") && error.contains("[1, 3, 4]") && error.contains("[1, 3, 5]"), "{error}");
+        assert!(
+            error.contains("n.layers.0.weight") && error.contains("[1, 3, 4]") && error.contains("[1, 3, 5]"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -95,8 +95,7 @@ impl Recipe {
             before += part.weight;
             let to = (self.rows as f64 * before / total).round() as usize;
             let streams = Streams::new(self.seed.wrapping_add(k as u64 * 0x9e37_79b9_7f4a_7c15));
-            let options =
-                CollectOptions { rows: to - from, lanes: self.lanes, streams, progress: Some(&progress) };
+            let options = CollectOptions { rows: to - from, lanes: self.lanes, streams, progress: Some(&progress) };
             let actor = PolicyActor::new(policy, self.mean);
             out.extend(&tce_sim::collect(self.agent, self.shift, &actor, &options)?);
         }
@@ -135,10 +134,7 @@ pub fn stand_in(agent: Agent, quality: Quality, rows: usize, seed: u64, shared: 
     use Agent::*;
     let medium: &[(&str, f64)] = match agent {
         HalfCheetah => &[("yth_sac_halfcheetah_seed1_B_20201001_0803_e9a4951", 1.0)],
-        Hopper => &[
-            ("zoo_sac_hopper_final", 0.7),
-            ("yth_sac_hopper_seed4_C_20201001_0828_6ebb228", 0.3),
-        ],
+        Hopper => &[("zoo_sac_hopper_final", 0.7), ("yth_sac_hopper_seed4_C_20201001_0828_6ebb228", 0.3)],
         Walker2d => &[("yth_sac_walker2d_seed4_D_20201002_0053_baba2dc", 0.56), ("zoo_tqc_walker2d_final", 0.44)],
         Ant => &[("yth_sac_ant_seed0_A_20201001_0516_32b71a2", 1.0)],
     };

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Quality, ScoreTable, Shift};
-use tce_diffusion::{Process, Sampler, Target};
+use tce_diffusion::{Process, Sampler, Schedule, Target};
 use tce_learn::{BcConfig, IqlConfig, LabelConfig, RegulariserConfig, RegulariserKind};
 use toml::{Table, Value};
 
@@ -79,6 +79,7 @@ pub struct GeneratorConfig {
     pub transition_steps: u64,
     pub batch: usize,
     pub learning_rate: f64,
+    pub schedule: Schedule,
     pub ema: f64,
     pub balanced: bool,
     pub source_states: bool,
@@ -429,7 +430,11 @@ mod tests {
     fn every_preset_is_a_whole_configuration() {
         for preset in [Preset::Paper, Preset::Default, Preset::Quick] {
             let config = layered(preset, None, &[]).unwrap().config().unwrap();
-            assert_eq!(toml::from_str::<Config>(&config.to_toml()).unwrap(), config, "{preset:?} survives a round trip");
+            assert_eq!(
+                toml::from_str::<Config>(&config.to_toml()).unwrap(),
+                config,
+                "{preset:?} survives a round trip"
+            );
         }
     }
 
@@ -446,9 +451,13 @@ mod tests {
 
     #[test]
     fn the_last_layer_wins_and_is_remembered() {
-        let layers = layered(Preset::Quick, None, &["learner.steps=7", "learner.algorithm=bc", "filter.z_threshold=2"]).unwrap();
+        let layers =
+            layered(Preset::Quick, None, &["learner.steps=7", "learner.algorithm=bc", "filter.z_threshold=2"]).unwrap();
         let config = layers.config().unwrap();
-        assert_eq!((config.learner.steps, config.learner.algorithm, config.filter.z_threshold), (7, Algorithm::Bc, 2.0));
+        assert_eq!(
+            (config.learner.steps, config.learner.algorithm, config.filter.z_threshold),
+            (7, Algorithm::Bc, 2.0)
+        );
         let values = layers.values();
         let origin = |key: &str| values.iter().find(|v| v.0 == key).unwrap().2.clone();
         assert_eq!(origin("learner.steps"), "--set learner.steps=7");

@@ -59,7 +59,8 @@ impl Error {
             Error::Usage(_) => 2,
             Error::Interrupted
             | Error::Data(tce_data::DataError::Interrupted)
-            | Error::Sim(tce_sim::SimError::Interrupted) => 130,
+            | Error::Sim(tce_sim::SimError::Interrupted)
+            | Error::Diffusion(tce_diffusion::DiffusionError::Interrupted { .. }) => 130,
             _ => 1,
         }
     }

@@ -95,9 +95,10 @@ impl Finisher<'_> {
     /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite never do.
     fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
         let d = self.units.live.len();
-        let finite = states.chunks_exact(d).zip(successors.chunks_exact(d)).map(|(s, s2)| {
-            s.iter().chain(s2).all(|v| v.is_finite())
-        });
+        let finite = states
+            .chunks_exact(d)
+            .zip(successors.chunks_exact(d))
+            .map(|(s, s2)| s.iter().chain(s2).all(|v| v.is_finite()));
         let mut keep: Vec<bool> = finite.collect();
         if self.filter.enabled {
             let (states, successors) = (choose(states, d, &keep), choose(successors, d, &keep));

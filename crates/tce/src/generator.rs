@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams};
 use tce_data::{Rows, Standardizer, Transitions};
 use tce_diffusion::{
-    Condition, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel, Target, TrainConfig, Trainer, uniform_labels,
+    Condition, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target, TrainConfig, Trainer,
+    uniform_labels,
 };
 use tce_nn::Device;
 
@@ -128,6 +129,7 @@ struct TrainingSpec<'a> {
     transition_steps: u64,
     batch: usize,
     learning_rate: f64,
+    schedule: Schedule,
     ema: f64,
     balanced: bool,
     source_states: bool,
@@ -152,6 +154,7 @@ impl Generator {
             transition_steps: g.transition_steps,
             batch: g.batch,
             learning_rate: g.learning_rate,
+            schedule: g.schedule,
             ema: g.ema,
             balanced: g.balanced,
             source_states: g.source_states,
@@ -190,7 +193,7 @@ impl Generator {
         let source = if g.source_states { Some(inputs.source_rows()?) } else { None };
         let units = Units::fit(target, source, g.target);
         let d = units.live.len();
-        let train = TrainConfig { learning_rate: g.learning_rate, batch: g.batch, ema: g.ema, ..TrainConfig::default() };
+        let train = TrainConfig { learning_rate: g.learning_rate, schedule: g.schedule, batch: g.batch, ema: g.ema };
         let (s, s2) = (units.take(&target.observations), units.take(&target.next_observations));
         let target_states = units.state.apply(&s);
 
@@ -306,7 +309,13 @@ fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress {
     Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
 }
 
-fn run(trainer: &mut Trainer, data: &ScoreData, steps: u64, metrics: &Mutex<&mut Metrics>, name: &str) -> Result<Vec<f32>> {
+fn run(
+    trainer: &mut Trainer,
+    data: &ScoreData,
+    steps: u64,
+    metrics: &Mutex<&mut Metrics>,
+    name: &str,
+) -> Result<Vec<f32>> {
     let mut last = Vec::new();
     trainer.train(std::slice::from_ref(data), steps, |step, losses| {
         last = losses.to_vec();

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use tce_base::sha256_file;
-use tce_data::{Agent, LoadOptions, Loaded, ReferenceScores, Shift, Transitions, ensure_same_agent, infer_agents, load};
+use tce_data::{
+    Agent, LoadOptions, Loaded, ReferenceScores, Shift, Transitions, ensure_same_agent, infer_agents, load,
+};
 
 use crate::actors::{shared_folder, stand_in};
 use crate::error::{Error, Result};

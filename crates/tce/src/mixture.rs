@@ -47,7 +47,8 @@ pub fn extra_rows(
             let pairs = vec![(source.observations.clone(), source.next_observations.clone()); seeds.len()];
             // Only the actions are inferred; everything else stays as the source has it.
             let labelled = models.label(&pairs, TerminalHandling::None)?;
-            let table = |l: tce_learn::Labelled| Arc::new(Transitions { actions: l.transitions.actions, ..source.clone() });
+            let table =
+                |l: tce_learn::Labelled| Arc::new(Transitions { actions: l.transitions.actions, ..source.clone() });
             Some(labelled.into_iter().map(table).collect())
         }
         SourceRows::Nearest | SourceRows::Transport => {

@@ -69,8 +69,9 @@ impl Stage {
     pub fn summary<T: DeserializeOwned>(&self) -> Result<Option<T>> {
         let path = self.file("done.json");
         let Ok(bytes) = fs::read(&path) else { return Ok(None) };
-        let done: Done<T> = serde_json::from_slice(&bytes)
-            .map_err(|e| Error::Failed(format!("{}: {e}; remove the directory to do the stage again", path.display())))?;
+        let done: Done<T> = serde_json::from_slice(&bytes).map_err(|e| {
+            Error::Failed(format!("{}: {e}; remove the directory to do the stage again", path.display()))
+        })?;
         for (name, expected) in &done.files {
             let file = self.file(name);
             let found = sha256_file(&file)?;

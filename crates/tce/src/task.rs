@@ -89,12 +89,15 @@ impl FromStr for Task {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let form = || format!("`{text}` is no task; expected AGENT-SHIFT:SOURCE->TARGET, as in hopper-morph:medium->expert");
+        let form =
+            || format!("`{text}` is no task; expected AGENT-SHIFT:SOURCE->TARGET, as in hopper-morph:medium->expert");
         let (environment, data) = text.split_once(':').ok_or_else(form)?;
         let (source, target) = data.split_once("->").ok_or_else(form)?;
         let (agent, shift) = parse_environment(environment).map_err(|e| format!("{}: {e}", form()))?;
         if shift == Shift::Source {
-            return Err(format!("`{text}`: the target domain must differ from the source domain; name a shift, as in {agent}-morph"));
+            return Err(format!(
+                "`{text}`: the target domain must differ from the source domain; name a shift, as in {agent}-morph"
+            ));
         }
         let task = Task { agent, shift, source: source.trim().parse()?, target: target.trim().parse()? };
         Ok(task)
@@ -118,15 +121,19 @@ mod tests {
     fn the_papers_short_names_are_read() {
         let task: Task = "ant-gravity_0.5:m-r->m-e".parse().unwrap();
         assert_eq!(task.to_string(), "ant-gravity:medium-replay->medium-expert");
-        assert_eq!(
-            task.target_file(Path::new("/s")),
-            Path::new("/s/datasets/otdf/ant_gravity_0.5_medium_expert.hdf5")
-        );
+        assert_eq!(task.target_file(Path::new("/s")), Path::new("/s/datasets/otdf/ant_gravity_0.5_medium_expert.hdf5"));
     }
 
     #[test]
     fn nonsense_is_refused_with_the_form_expected() {
-        for text in ["", "hopper", "hopper-morph", "hopper-morph:medium", "frog-morph:medium->expert", "hopper-source:medium->expert"] {
+        for text in [
+            "",
+            "hopper",
+            "hopper-morph",
+            "hopper-morph:medium",
+            "frog-morph:medium->expert",
+            "hopper-source:medium->expert",
+        ] {
             assert!(text.parse::<Task>().is_err(), "{text}");
         }
     }

@@ -75,10 +75,9 @@ impl Variant {
             Variant::SimpleAug => {
                 format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql(true, "none", 0.0))
             }
-            Variant::TargetOnly => format!(
-                "{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n",
-                iql(false, "none", 0.0)
-            ),
+            Variant::TargetOnly => {
+                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql(false, "none", 0.0))
+            }
             Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "all", 1.0)),
             Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "relabelled", 1.0)),
             Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql(true, "none", 0.0)),
@@ -106,7 +105,9 @@ mod tests {
         for preset in [Preset::Paper, Preset::Default, Preset::Quick] {
             for &variant in Variant::value_variants() {
                 let config = Layered::new(preset, None, Some(variant), None, &[]).unwrap().config().unwrap();
-                assert!(config.mixture.lambda > 0.0 || matches!(config.mixture.source, crate::config::SourceRows::None));
+                assert!(
+                    config.mixture.lambda > 0.0 || matches!(config.mixture.source, crate::config::SourceRows::None)
+                );
             }
         }
     }

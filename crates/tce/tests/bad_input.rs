@@ -16,7 +16,10 @@ fn augment(dir: &Path, source: &str, target: &str, more: &[&str]) -> (i32, Strin
     args.extend(more);
     let output = tce(dir, &args);
     assert!(!dir.join("out.hdf5").exists(), "no output after a failure");
-    let parts: Vec<_> = fs::read_dir(dir).unwrap().filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains(".part")).collect();
+    let parts: Vec<_> = fs::read_dir(dir)
+        .unwrap()
+        .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains(".part"))
+        .collect();
     assert!(parts.is_empty(), "nothing half-written: {parts:?}");
     // miette wraps lines and draws a margin; the words matter here.
     let text = String::from_utf8_lossy(&output.stderr).replace(['│', '\n'], " ");
@@ -36,6 +39,19 @@ fn unusable_data_is_refused_before_any_work() {
     let mut nan = random_rows(Agent::Hopper, Shift::Morph, 50, 3);
     nan.rewards[7] = f32::NAN;
     save_d4rl(&dir.join("nan.hdf5"), &nan, &BTreeMap::new(), &[]).unwrap();
+    let mut lacking = hdf5_pure::FileBuilder::new();
+    for (name, columns) in [("observations", 11), ("actions", 3), ("next_observations", 11)] {
+        lacking.create_dataset(name).with_f32_data(&vec![0.5; 20 * columns]).with_shape(&[20, columns as u64]);
+    }
+    lacking.create_dataset("terminals").with_f32_data(&[0.0; 20]);
+    lacking.write(dir.join("lacking.hdf5")).unwrap();
+    let mut wide = hdf5_pure::FileBuilder::new();
+    for (name, columns) in [("observations", 11), ("actions", 3), ("next_observations", 12)] {
+        wide.create_dataset(name).with_f32_data(&vec![0.5; 20 * columns]).with_shape(&[20, columns as u64]);
+    }
+    wide.create_dataset("rewards").with_f32_data(&[0.0; 20]);
+    wide.create_dataset("terminals").with_f32_data(&[0.0; 20]);
+    wide.write(dir.join("wide.hdf5")).unwrap();
     let other = random_rows(Agent::HalfCheetah, Shift::Morph, 100, 3);
     save_d4rl(&dir.join("other.hdf5"), &other, &BTreeMap::new(), &[]).unwrap();
 
@@ -45,6 +61,8 @@ fn unusable_data_is_refused_before_any_work() {
         ("truncated.hdf5", vec!["truncated.hdf5"]),
         ("text.hdf5", vec!["text.hdf5"]),
         ("nan.hdf5", vec!["nan.hdf5", "rewards", "7"]),
+        ("lacking.hdf5", vec!["lacking.hdf5", "rewards"]),
+        ("wide.hdf5", vec!["wide.hdf5", "next_observations", "12", "11"]),
         ("other.hdf5", vec!["different agents"]),
     ] {
         let (code, message) = augment(dir, "source.hdf5", file, &[]);
@@ -99,7 +117,8 @@ fn a_full_disk_leaves_nothing_behind() {
     }
     data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let out = mount.join("out.hdf5");
-    let mut args = vec!["augment", "--source", "source.hdf5", "--target", "target.hdf5", "--out", out.to_str().unwrap()];
+    let mut args =
+        vec!["augment", "--source", "source.hdf5", "--target", "target.hdf5", "--out", out.to_str().unwrap()];
     args.extend(TINY);
     let output = tce(dir.path(), &args);
     let left = fs::read_dir(&mount).unwrap().count();

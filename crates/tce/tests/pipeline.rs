@@ -38,7 +38,8 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
         tce_json(dir.path(), &args)
     };
     let (first, again, two) = (run("one", "1"), run("again", "1"), run("two", "2"));
-    let scores = |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
+    let scores =
+        |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
     assert_eq!(scores(&first).len(), 5, "three floors and two variants");
     assert_eq!(scores(&first), scores(&again));
     assert_eq!(scores(&first), scores(&two));
@@ -62,7 +63,8 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
     let mut bytes = policy.1.clone();
     *bytes.last_mut().unwrap() ^= 1;
     fs::write(&path, bytes).unwrap();
-    let mut args = vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og,tce-nn", "--seeds", "2", "--out", "one"];
+    let mut args =
+        vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og,tce-nn", "--seeds", "2", "--out", "one"];
     args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
     args.extend(TINY);
     let output = tce(dir.path(), &args);
@@ -91,7 +93,8 @@ fn every_variant_runs_and_leaves_its_specification() {
         let metrics = fs::read_to_string(directory.join("metrics.jsonl")).unwrap();
         assert!(metrics.lines().all(|l| serde_json::from_str::<serde_json::Value>(l).is_ok()));
     }
-    let rows_of = |variant: &str| rows.iter().find(|r| r["variant"] == variant).unwrap()["extra_rows"].as_u64().unwrap();
+    let rows_of =
+        |variant: &str| rows.iter().find(|r| r["variant"] == variant).unwrap()["extra_rows"].as_u64().unwrap();
     assert_eq!(rows_of("target-source"), 1500);
     assert_eq!(rows_of("iql-swt"), 1500);
     assert_eq!(rows_of("bc-raw"), 0);
@@ -107,7 +110,9 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     args.extend(["--out", "wide.hdf5"]);
     args.extend(&TINY[..10]);
     let report = tce_json(dir.path(), &args);
-    let wide = load(&dir.path().join("wide.hdf5"), &LoadOptions { columns: vec!["origin".into()], ..LoadOptions::default() }).unwrap();
+    let wide =
+        load(&dir.path().join("wide.hdf5"), &LoadOptions { columns: vec!["origin".into()], ..LoadOptions::default() })
+            .unwrap();
     let kept = report["generated"]["kept"].as_u64().unwrap() as usize;
     assert_eq!(wide.transitions.len(), 600 + kept);
     assert_eq!(wide.columns["origin"].iter().sum::<f32>() as usize, kept);
@@ -118,18 +123,34 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     // An existing output is not overwritten by accident.
     assert_eq!(tce(dir.path(), &args).status.code(), Some(2));
 
-    let mut args = vec!["learn", "--target", "target.hdf5", "--extra", "wide.hdf5", "--env", "halfcheetah-morph", "--out", "policy"];
+    let mut args = vec![
+        "learn",
+        "--target",
+        "target.hdf5",
+        "--extra",
+        "wide.hdf5",
+        "--env",
+        "halfcheetah-morph",
+        "--out",
+        "policy",
+    ];
     args.extend(["--seeds", "2"]);
     args.extend(&TINY[10..]);
     let learned = tce_json(dir.path(), &args);
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
 
     let policy = "policy/policy-seed1.safetensors";
-    let evaluated = tce_json(dir.path(), &["evaluate", policy, "--env", "halfcheetah-morph", "--episodes", "2", "--seed", "1"]);
-    assert_eq!(evaluated[0]["returns"], learned["evaluations"][1]["returns"], "a saved policy acts like the learned one");
+    let evaluated =
+        tce_json(dir.path(), &["evaluate", policy, "--env", "halfcheetah-morph", "--episodes", "2", "--seed", "1"]);
+    assert_eq!(
+        evaluated[0]["returns"], learned["evaluations"][1]["returns"],
+        "a saved policy acts like the learned one"
+    );
 
-    let mixture = ["collect", "--env", "halfcheetah-morph", "--actor", policy, "--actor", "policy/policy-seed0.safetensors:3"];
-    let collected = tce_json(dir.path(), &[&mixture[..], &["--rows", "500", "--lanes", "4", "--out", "c.hdf5"]].concat());
+    let mixture =
+        ["collect", "--env", "halfcheetah-morph", "--actor", policy, "--actor", "policy/policy-seed0.safetensors:3"];
+    let collected =
+        tce_json(dir.path(), &[&mixture[..], &["--rows", "500", "--lanes", "4", "--out", "c.hdf5"]].concat());
     assert_eq!(collected["content"]["rows"], 500);
     let checked = tce_json(dir.path(), &["data", "check", "c.hdf5", "--replay", "--env", "halfcheetah-morph"]);
     assert_eq!(checked[0]["passes"], true, "{checked}");

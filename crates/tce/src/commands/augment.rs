@@ -91,7 +91,13 @@ impl Augment {
                 g.labels.map_or("-".into(), |l| format!("{:.4}", l.reward_rmse)),
             ];
             let header = [
-                "file", "target rows", "generated rows", "filtered out", "actions clipped", "action RMSE", "reward RMSE",
+                "file",
+                "target rows",
+                "generated rows",
+                "filtered out",
+                "actions clipped",
+                "action RMSE",
+                "reward RMSE",
             ];
             table(&header, [row])
         });

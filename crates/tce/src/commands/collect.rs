@@ -64,7 +64,9 @@ impl Collect {
         let (agent, shift) = self.env;
         let recipe = match self.quality {
             Some(_) if shift != Shift::Source => {
-                return Err(Error::Usage("--quality names source-domain data; give --actor for a changed robot".into()));
+                return Err(Error::Usage(
+                    "--quality names source-domain data; give --actor for a changed robot".into(),
+                ));
             }
             Some(quality) => {
                 let stand_in = stand_in(agent, quality, self.rows, self.seed, &shared_folder())?;

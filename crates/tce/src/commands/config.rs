@@ -42,7 +42,8 @@ impl Config {
         let layered = args.config.layered(args.task, args.variant)?;
         // A configuration that does not hold together is refused, not shown.
         layered.config()?;
-        let entries: Vec<_> = layered.values().into_iter().map(|(key, value, from)| Entry { key, value, from }).collect();
+        let entries: Vec<_> =
+            layered.values().into_iter().map(|(key, value, from)| Entry { key, value, from }).collect();
         output.print(&entries, |entries| {
             table(&["key", "value", "from"], entries.iter().map(|e| [e.key.clone(), e.value.clone(), e.from.clone()]))
         });

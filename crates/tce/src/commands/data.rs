@@ -103,7 +103,10 @@ impl Inspect {
         for file in &self.files {
             let Loaded { transitions, report, .. } = load(file, &LoadOptions::default())?;
             let content = tce_data::inspect(&transitions, EPISODE_LIMIT);
-            let environment = self.env.or_else(|| environment_of(file)).filter(|(a, _)| a.dims() == (transitions.obs_dim, transitions.act_dim));
+            let environment = self
+                .env
+                .or_else(|| environment_of(file))
+                .filter(|(a, _)| a.dims() == (transitions.obs_dim, transitions.act_dim));
             let reference = environment.and_then(|(a, s)| reference_scores(a, s, ScoreTable::default()));
             all.push(Inspected {
                 load: report,
@@ -133,8 +136,19 @@ impl Inspect {
                 ]
             });
             let header = [
-                "file", "rows", "dropped", "dims", "episodes", "terminals", "length", "return", "min", "max", "score",
-                "dead", "NaN",
+                "file",
+                "rows",
+                "dropped",
+                "dims",
+                "episodes",
+                "terminals",
+                "length",
+                "return",
+                "min",
+                "max",
+                "score",
+                "dead",
+                "NaN",
             ];
             let mut text = table(&header, rows);
             for i in all.iter().filter(|_| self.dimensions) {

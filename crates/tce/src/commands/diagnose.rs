@@ -127,11 +127,7 @@ impl GeneratorArgs {
         };
         let samplers = match self.only {
             true => vec![config.generator.sampler],
-            false => vec![
-                Sampler::paper(),
-                Sampler::Heun { steps: 18 },
-                Sampler::DpmSolver { steps: 20 },
-            ],
+            false => vec![Sampler::paper(), Sampler::Heun { steps: 18 }, Sampler::DpmSolver { steps: 20 }],
         };
         let mut rows = Vec::new();
         let mut floors = None;
@@ -153,7 +149,8 @@ impl GeneratorArgs {
                 let sw = sliced_wasserstein(&states(training), &states(&held_out), d, 256, &Streams::new(self.seed));
                 let pair = (held_out.observations.clone(), held_out.next_observations.clone());
                 let real = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-                floors = Some((sw, consistency(place.0, place.1, &real, &step_std(training, &units.live), &units.live)?));
+                floors =
+                    Some((sw, consistency(place.0, place.1, &real, &step_std(training, &units.live), &units.live)?));
             }
             for sampler in &samplers {
                 let quality = quality(
@@ -202,7 +199,16 @@ fn render(r: &Report) -> String {
         ]
     });
     let header = [
-        "process", "sampler", "NFE", "SW train", "SW held out", "std ratio", "max", "consistency y=0", "expanded", "rows/s",
+        "process",
+        "sampler",
+        "NFE",
+        "SW train",
+        "SW held out",
+        "std ratio",
+        "max",
+        "consistency y=0",
+        "expanded",
+        "rows/s",
     ];
     format!(
         "{}: {} training rows, {} held out\nSW between training and held-out rows: {:.3}; consistency of held-out rows with \

@@ -66,7 +66,10 @@ impl Learn {
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
         if self.out.join("metrics.jsonl").exists() {
-            return Err(Error::Usage(format!("{} holds the results of another learning; choose another --out", self.out.display())));
+            return Err(Error::Usage(format!(
+                "{} holds the results of another learning; choose another --out",
+                self.out.display()
+            )));
         }
         let dims = self.env.map(|(agent, _)| agent.dims());
         let read = |path: &PathBuf| -> Result<Arc<_>> {

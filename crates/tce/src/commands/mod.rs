@@ -81,7 +81,10 @@ impl Cli {
 /// An output that exists is only replaced when the user says so.
 fn refuse_existing(path: &Path, force: bool) -> Result<()> {
     if path.exists() && !force {
-        return Err(Error::Usage(format!("{} exists; choose another name, or say --force to replace it", path.display())));
+        return Err(Error::Usage(format!(
+            "{} exists; choose another name, or say --force to replace it",
+            path.display()
+        )));
     }
     Ok(())
 }

@@ -96,8 +96,13 @@ impl Run {
 
 fn render(report: &Report) -> String {
     let lines = report.rows.iter().map(|r| {
-        let returns: Vec<f64> =
-            r.summary.learned.evaluations.iter().map(|e| e.returns.iter().sum::<f64>() / e.returns.len() as f64).collect();
+        let returns: Vec<f64> = r
+            .summary
+            .learned
+            .evaluations
+            .iter()
+            .map(|e| e.returns.iter().sum::<f64>() / e.returns.len() as f64)
+            .collect();
         [
             if r.floor { format!("{} (floor)", r.title) } else { r.title.clone() },
             plus_minus(&r.summary.scores),
