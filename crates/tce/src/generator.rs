@@ -171,7 +171,7 @@ impl Generator {
             return Ok((generator, stage, trained));
         }
         let started = std::time::Instant::now();
-        let mut metrics = Metrics::open(stage.directory())?;
+        let mut metrics = Metrics::start(stage.directory())?;
         let (generator, mut trained) = Self::train_now(inputs, config, seeds, device, &mut metrics)?;
         trained.seconds = started.elapsed().as_secs_f64();
         generator.state.save(&stage.file(files[0]))?;

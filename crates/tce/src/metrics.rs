@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde_json::{Map, Value, json};
 use tce_base::FileError;
 
-/// The metrics of one run. Both files are appended to line by line, so that a killed run keeps what it had.
+/// The metrics of one stage, written line by line: what a killed run had is there to be looked at.
 pub struct Metrics {
     path: PathBuf,
     lines: BufWriter<File>,
@@ -17,13 +17,19 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Opens `metrics.jsonl` and `tensorboard/` in `directory`.
-    pub fn open(directory: &Path) -> Result<Self, FileError> {
+    /// Starts `metrics.jsonl` and `tensorboard/` in `directory` anew: a stage that was interrupted is done again from its
+    /// beginning, and so are its metrics.
+    pub fn start(directory: &Path) -> Result<Self, FileError> {
         fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let path = directory.join("metrics.jsonl");
-        let file = OpenOptions::new().create(true).append(true).open(&path);
-        let file = file.map_err(|e| FileError::new(&path, "open", e))?;
+        let file = File::create(&path).map_err(|e| FileError::new(&path, "create", e))?;
         let events_root = directory.join("tensorboard");
+        match fs::remove_dir_all(&events_root) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(FileError::new(&events_root, "remove the old", e));
+            }
+            _ => {}
+        }
         Ok(Self { path, lines: BufWriter::new(file), events_root, events: Vec::new() })
     }
 
@@ -146,7 +152,7 @@ mod tests {
     #[test]
     fn lines_are_json_and_events_are_written() {
         let dir = tempfile::tempdir().unwrap();
-        let mut metrics = Metrics::open(dir.path()).unwrap();
+        let mut metrics = Metrics::start(dir.path()).unwrap();
         metrics.log("learn", 10, 1, [("loss", 0.5), ("score", 61.7)]).unwrap();
         let text = fs::read_to_string(dir.path().join("metrics.jsonl")).unwrap();
         let line: Value = serde_json::from_str(text.trim()).unwrap();

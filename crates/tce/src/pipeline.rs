@@ -126,12 +126,7 @@ pub fn run(
     };
     let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
     drop(extra);
-    // A run that was interrupted starts its learning anew, and so do its metrics.
-    for stale in ["metrics.jsonl", "tensorboard"] {
-        let path = stage.file(stale);
-        let _ = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
-    }
-    let mut metrics = Metrics::open(stage.directory())?;
+    let mut metrics = Metrics::start(stage.directory())?;
     let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, device)?;
     for (policy, seed) in policies.iter().zip(seeds) {
         let file = format!("policy-seed{seed}.safetensors");

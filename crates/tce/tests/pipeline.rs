@@ -102,6 +102,29 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert!(rows_of("tce-no-reg") < 600, "the filter rejects something");
 }
 
+/// The paper's process, sampler and learner, cut short; rows as many as the paper generates, (1 - λ) |D_src|.
+#[test]
+fn the_papers_preset_runs() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Ant, Shift::Morph);
+    let mut args = vec!["run", "ant-morph:medium->expert", "--preset", "paper", "--variant", "tce-nn", "--no-floors"];
+    args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+    args.extend(TINY);
+    args.extend(["--set", "generator.rows=0", "--set", "learner.behaviour.cvae.hidden=[32]"]);
+    let report = tce_json(dir.path(), &args);
+    let generated = &report["rows"][0]["generated"][0];
+    assert_eq!(generated["sampled"], 1350, "λ = .1 of 1500 source rows");
+    assert_eq!(generated["evaluations"], 14, "two stages of four predictor and three corrector steps");
+    assert_eq!(generated["terminal"], 0.0);
+    let rows = load(
+        &dir.path().join(report["rows"][0]["directory"].as_str().unwrap()).join("generated-seed0.hdf5"),
+        &LoadOptions::default(),
+    );
+    let rows = rows.unwrap().transitions;
+    let tail = rows.observations.chunks(111).flat_map(|s| &s[27..]);
+    assert!(tail.copied().all(|v| v == 0.0), "Ant's contact slots stay zero");
+}
+
 #[test]
 fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     let dir = tempfile::tempdir().unwrap();
@@ -158,4 +181,49 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     assert_eq!(wrong.status.code(), Some(1), "rows of the morphed robot do not replay in the source robot");
     let inspected = tce_json(dir.path(), &["data", "inspect", "c.hdf5", "target.hdf5"]);
     assert_eq!(inspected.as_array().unwrap().len(), 2);
+}
+
+/// An interrupted run keeps the stages it finished and takes them up when it is called again.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_continues_where_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let mut args = vec!["run", "hopper-morph:medium->expert", "--no-floors", "--out", "out"];
+    args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+    args.extend(TINY);
+    let mut endless = args.clone();
+    endless.extend(["--set", "learner.steps=100000000"]);
+    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_tce"))
+        .args(&endless)
+        .current_dir(dir.path())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let generated = || {
+        let stages = fs::read_dir(dir.path().join("out/stages")).into_iter().flatten().flatten();
+        stages
+            .filter(|e| {
+                e.file_name().to_string_lossy().starts_with("generated-") && e.path().join("done.json").exists()
+            })
+            .count()
+    };
+    let started = std::time::Instant::now();
+    while generated() == 0 {
+        assert!(started.elapsed().as_secs() < 100, "the generated stage is finished in time");
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    let kill = std::process::Command::new("kill").arg(child.id().to_string()).status().unwrap();
+    assert!(kill.success());
+    assert_eq!(child.wait().unwrap().code(), Some(130), "SIGTERM ends the run at a safe point");
+    let stamp = || {
+        let stages = fs::read_dir(dir.path().join("out/stages")).unwrap().flatten();
+        let mut all: Vec<_> =
+            stages.map(|e| (e.path(), fs::metadata(e.path().join("done.json")).unwrap().modified().unwrap())).collect();
+        all.sort();
+        all
+    };
+    let before = stamp();
+    tce_json(dir.path(), &args);
+    assert_eq!(stamp(), before, "finished stages are not done again");
 }

@@ -110,13 +110,14 @@ impl Collect {
 
 /// `FILE` or `FILE:WEIGHT`.
 fn part(text: &str) -> Result<Part> {
-    if let Some((file, weight)) = text.rsplit_once(':') {
-        if let Ok(weight) = weight.parse::<f64>() {
-            if weight > 0.0 && weight.is_finite() {
-                return Ok(Part { actor: file.into(), weight });
-            }
-            return Err(Error::Usage(format!("--actor {text}: a weight must be a positive number")));
+    // A file's own name may hold a colon: only a number behind it is a weight.
+    if let Some((file, weight)) = text.rsplit_once(':')
+        && let Ok(weight) = weight.parse::<f64>()
+    {
+        if weight > 0.0 && weight.is_finite() {
+            return Ok(Part { actor: file.into(), weight });
         }
+        return Err(Error::Usage(format!("--actor {text}: a weight must be a positive number")));
     }
     Ok(Part { actor: text.into(), weight: 1.0 })
 }

@@ -114,7 +114,7 @@ impl GeneratorArgs {
         )?;
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
-        let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };
+        let inputs = Inputs { target: Table { rows: training, hash }, ..inputs };
         let training = &inputs.target.rows;
         let device = cpu();
         let seeds = [self.seed];

@@ -94,7 +94,7 @@ impl Learn {
             trajectories: vec![target.clone()],
         };
         let data = seeds.iter().map(member).collect();
-        let mut metrics = Metrics::open(&self.out)?;
+        let mut metrics = Metrics::start(&self.out)?;
         tce_base::write_atomically(&self.out.join("config.toml"), config.to_toml().as_bytes())?;
         let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, &cpu())?;
         let mut files = Vec::new();
