@@ -14,9 +14,10 @@ use tce_sim::terminal_rule;
 
 use crate::config::{Config, FilterConfig, LabelsConfig, Terminal};
 use crate::error::{Error, Result};
-use crate::generator::{Generator, Units};
+use crate::generator::Generator;
 use crate::inputs::{InputSpec, Inputs};
 use crate::stage::Stage;
+use crate::units::Units;
 
 /// What generating rows leaves behind, per member.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

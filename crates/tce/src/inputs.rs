@@ -12,6 +12,20 @@ use crate::actors::{shared_folder, stand_in};
 use crate::error::{Error, Result};
 use crate::task::Task;
 
+/// The files of a benchmark task, and where results go.
+#[derive(Clone, Debug, clap::Args)]
+pub struct DataArgs {
+    /// Source data (default: collected from the actors found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    pub source: Option<PathBuf>,
+    /// Target data (default: OTDF's file found in TCE_SHARED).
+    #[arg(long, value_name = "FILE")]
+    pub target: Option<PathBuf>,
+    /// Where results and finished stages are kept.
+    #[arg(long, default_value = "runs")]
+    pub out: PathBuf,
+}
+
 /// Source and target, and what is known about where they come from.
 #[derive(Debug)]
 pub struct Inputs {
@@ -59,17 +73,12 @@ impl Inputs {
         Self { agent, shift: None, target, source }.checked()
     }
 
-    /// The data of a benchmark task: `source` and `target` where given; otherwise OTDF's file and rows collected from
-    /// stand-in actors, both from the shared folder. Collected rows are kept in `cache`.
-    pub fn of_task(
-        task: Task,
-        source: Option<&Path>,
-        target: Option<&Path>,
-        source_rows: Option<usize>,
-        cache: &Path,
-    ) -> Result<Self> {
+    /// The data of a benchmark task: files where given; otherwise OTDF's file and `source_rows` rows collected from
+    /// stand-in actors, both from the shared folder. Collected rows are kept beside the results. Without `source_rows`
+    /// no source is looked at.
+    pub fn of_task(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<Self> {
         let shared = shared_folder();
-        let target = target.map_or_else(|| task.target_file(&shared), Path::to_owned);
+        let target = args.target.clone().unwrap_or_else(|| task.target_file(&shared));
         if !target.exists() {
             return Err(Error::missing(
                 &target,
@@ -78,13 +87,13 @@ impl Inputs {
         }
         let dims = Some(task.agent.dims());
         let target = table(&target, dims)?;
-        let source: Option<PathBuf> = match (source, source_rows) {
-            (Some(path), _) => Some(path.to_owned()),
-            (None, Some(rows)) => {
+        let source: Option<PathBuf> = match (source_rows, &args.source) {
+            (None, _) => None,
+            (Some(_), Some(path)) => Some(path.clone()),
+            (Some(rows), None) => {
                 let recipe = stand_in(task.agent, task.source, rows, 0, &shared)?;
-                Some(recipe.cached(cache, &format!("{}-source-{}", task.agent, task.source))?)
+                Some(recipe.cached(&args.out.join("data"), &format!("{}-source-{}", task.agent, task.source))?)
             }
-            (None, None) => None,
         };
         let source = source.map(|s| table(&s, dims)).transpose()?;
         Self { agent: Some(task.agent), shift: Some(task.shift), target, source }.checked()

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_data::{Agent, ReferenceScores, Rows, Shift, Standardizer, Transitions};
+use tce_data::{Agent, ReferenceScores, Shift, Standardizer, Transitions};
 use tce_learn::{
     Bc, Buffer, Iql, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
     return_range_scale, train,
@@ -17,6 +17,7 @@ use crate::actors::{Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
+use crate::units::even_standardizer;
 
 /// The data of one member: target rows, and perhaps others.
 #[derive(Clone, Debug)]
@@ -58,22 +59,6 @@ impl Learned {
     pub fn scores(&self) -> Vec<f64> {
         self.evaluations.iter().filter_map(|e| e.score).collect()
     }
-}
-
-/// The map under which a member's batches have zero mean and unit variance: target and other rows count the same, as in
-/// a batch, however many more of the others there are.
-fn standardizer(target: &Transitions, extra: Option<&Transitions>) -> Standardizer {
-    let d = target.obs_dim;
-    let mut few = Vec::new();
-    if let Some(extra) = extra {
-        let n = target.len().min(extra.len());
-        (0..n).for_each(|i| few.extend_from_slice(extra.observation(i * extra.len() / n)));
-    }
-    let mut tables = vec![Rows::new(&target.observations, d)];
-    if !few.is_empty() {
-        tables.push(Rows::new(&few, d));
-    }
-    Standardizer::fit_on(&tables)
 }
 
 /// Learns one policy per member. Members are trained together, in as many groups as there are threads: a member's policy
@@ -181,7 +166,7 @@ fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
         _ => data.target.clone(),
     };
     let standardizer = match config.standardise {
-        true => standardizer(&target, data.extra.as_deref()),
+        true => even_standardizer(&target, data.extra.as_deref()),
         false => Standardizer::identity(target.obs_dim),
     };
     let reward_scale = match config.iql.reward_scale {

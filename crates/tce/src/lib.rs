@@ -8,6 +8,7 @@ mod error;
 mod expand;
 mod generator;
 mod inputs;
+mod layers;
 mod learning;
 mod metrics;
 mod mixture;
@@ -15,6 +16,7 @@ mod output;
 mod pipeline;
 mod stage;
 mod task;
+mod units;
 mod variant;
 
 pub use commands::Cli;

@@ -98,7 +98,7 @@ impl fmt::Display for Variant {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Layered, Preset};
+    use crate::layers::{Layered, Preset};
 
     #[test]
     fn every_variant_is_a_valid_layer_on_every_preset() {

@@ -8,10 +8,10 @@ use serde::Serialize;
 use tce_data::{Transitions, save_d4rl};
 use tce_nn::cpu;
 
-use crate::config::ConfigArgs;
 use crate::error::Result;
 use crate::expand::{Generated, expand};
 use crate::inputs::Inputs;
+use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
 
 /// Arguments of `augment`.

@@ -3,8 +3,8 @@
 use clap::{Args, Subcommand};
 use serde::Serialize;
 
-use crate::config::ConfigArgs;
 use crate::error::Result;
+use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
 use crate::task::Task;
 use crate::variant::Variant;

@@ -1,7 +1,5 @@
 //! `tce diagnose`.
 
-use std::path::PathBuf;
-
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::Streams;
@@ -11,12 +9,12 @@ use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::cpu;
 
-use crate::config::ConfigArgs;
 use crate::diagnostics::{Consistency, Quality, consistency, hold_out, quality, step_std};
 use crate::error::Result;
 use crate::expand::{Finisher, label_models};
 use crate::generator::Generator;
-use crate::inputs::{Inputs, Table};
+use crate::inputs::{DataArgs, Inputs, Table};
+use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
 use crate::task::Task;
 
@@ -38,15 +36,8 @@ pub struct GeneratorArgs {
     /// Share of the target rows (whole episodes) to hold out.
     #[arg(long, default_value_t = 0.2)]
     held_out: f64,
-    /// Source data (default: collected from the actors found in TCE_SHARED).
-    #[arg(long, value_name = "FILE")]
-    source: Option<PathBuf>,
-    /// Target data (default: OTDF's file found in TCE_SHARED).
-    #[arg(long, value_name = "FILE")]
-    target: Option<PathBuf>,
-    /// Where trained networks are kept.
-    #[arg(long, default_value = "runs")]
-    out: PathBuf,
+    #[command(flatten)]
+    data: DataArgs,
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -105,20 +96,14 @@ impl Diagnose {
 impl GeneratorArgs {
     fn run(self, output: Output) -> Result<()> {
         let config = self.config.layered(Some(self.task), None)?.config()?;
-        let inputs = Inputs::of_task(
-            self.task,
-            self.source.as_deref(),
-            self.target.as_deref(),
-            Some(config.source.rows),
-            &self.out.join("data"),
-        )?;
+        let inputs = Inputs::of_task(self.task, &self.data, Some(config.source.rows))?;
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
         let inputs = Inputs { target: Table { rows: training, hash }, ..inputs };
         let training = &inputs.target.rows;
         let device = cpu();
         let seeds = [self.seed];
-        let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.out, &device)?;
+        let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.data.out, &device)?;
         let place = (self.task.agent, self.task.shift);
 
         let processes = match self.only {
@@ -133,7 +118,7 @@ impl GeneratorArgs {
         let mut floors = None;
         for process in processes {
             let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
-            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.out, &device)?;
+            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.data.out, &device)?;
             let finisher = Finisher {
                 units: &generator.units,
                 models: &models,

@@ -8,8 +8,9 @@ use serde::Serialize;
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, reference_scores};
 use tce_nn::cpu;
 
-use crate::config::{Algorithm, ConfigArgs};
+use crate::config::Algorithm;
 use crate::error::{Error, Result};
+use crate::layers::ConfigArgs;
 use crate::learning::{Arena, Learned, MemberData, learn};
 use crate::metrics::Metrics;
 use crate::output::{Output, plus_minus, table};

@@ -1,14 +1,12 @@
 //! `tce run`.
 
-use std::path::PathBuf;
-
 use clap::Args;
 use serde::Serialize;
 use tce_nn::cpu;
 
-use crate::config::ConfigArgs;
 use crate::error::Result;
-use crate::inputs::Inputs;
+use crate::inputs::{DataArgs, Inputs};
+use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
 use crate::task::Task;
@@ -28,15 +26,8 @@ pub struct Run {
     /// The first seed.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Source data (default: collected from the actors found in TCE_SHARED).
-    #[arg(long, value_name = "FILE")]
-    source: Option<PathBuf>,
-    /// Target data (default: OTDF's file found in TCE_SHARED).
-    #[arg(long, value_name = "FILE")]
-    target: Option<PathBuf>,
-    /// Where results go.
-    #[arg(long, default_value = "runs")]
-    out: PathBuf,
+    #[command(flatten)]
+    data: DataArgs,
     /// Leave out the floors (cloning, cloning of the best half, IQL on the target alone).
     #[arg(long)]
     no_floors: bool,
@@ -75,18 +66,11 @@ impl Run {
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
         let source_rows = configs.iter().find(|c| c.needs_source()).map(|c| c.source.rows);
-        let needs_file = source_rows.is_some();
-        let inputs = Inputs::of_task(
-            self.task,
-            self.source.as_deref().filter(|_| needs_file),
-            self.target.as_deref(),
-            source_rows,
-            &self.out.join("data"),
-        )?;
+        let inputs = Inputs::of_task(self.task, &self.data, source_rows)?;
         let mut rows = Vec::new();
         for ((variant, floor), config) in variants.into_iter().zip(&configs) {
             let place = self.task.directory();
-            let summary = run(&variant.name(), &inputs, config, &seeds, &self.out, &place, &cpu())?;
+            let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, &cpu())?;
             rows.push(Row { title: variant.title().into(), variant, floor, summary });
         }
         output.print(&Report { task: self.task, rows }, render);
