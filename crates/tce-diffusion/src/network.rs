@@ -83,7 +83,7 @@ impl NetworkConfig {
     }
 }
 
-/// A population of score networks; see the [module](self).
+/// A population of score networks, Tables B.1 and B.2.
 #[derive(Module, Debug)]
 pub struct ScoreNetwork {
     time: Mlp,

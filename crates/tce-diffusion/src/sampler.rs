@@ -22,7 +22,7 @@ pub trait Denoiser {
     fn denoise(&self, x: Tensor<3>, level: Level) -> Tensor<3>;
 }
 
-/// Which sampler; see the [module](self).
+/// Which sampler.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampler {

@@ -2,7 +2,7 @@
 //!
 //! | function | formula | source |
 //! |---|---|---|
-//! | [`expectile_loss`] | mean of abs(τ - 1[u < 0]) u² | IQL Eq. 5; B.12 |
+//! | [`expectile_loss`] | mean of abs(τ - 1(u < 0)) u² | IQL Eq. 5; B.12 |
 //! | [`advantage_weights`] | min(exp(β u / scale), cap) | IQL Eq. 7; B.14 |
 //! | [`squared_error`] | (mean - a)², per component | OTDF's log-likelihood of a deterministic policy, up to constants |
 //! | [`normal_log_prob`] | Σ_d ln N(x_d; mean_d, σ_d²) | - |

@@ -19,7 +19,7 @@ use burn_flex::FlexTensor;
 use crate::activation::Activation;
 use crate::kernels::{self, Shape, room, written};
 
-/// act(x W + b); see the [module](self) for the shapes.
+/// act(x W + b); see the head of this file for the shapes.
 ///
 /// # Panics
 /// If the shapes do not fit each other, or the batch is empty.
