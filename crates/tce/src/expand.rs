@@ -92,7 +92,12 @@ pub struct Finisher<'a> {
     pub agent: Option<Agent>,
 }
 
-impl Finisher<'_> {
+impl<'a> Finisher<'a> {
+    /// What `config` says about filter and terminals, for the data of `inputs`.
+    pub fn new(units: &'a Units, models: &'a LabelModels, config: &'a Config, inputs: &Inputs) -> Self {
+        Self { units, models, filter: &config.filter, terminal: config.labels.terminal, agent: inputs.agent }
+    }
+
     /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite never do.
     fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
         let d = self.units.live.len();
@@ -191,13 +196,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
             let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
             let target = &inputs.target.rows;
             let (states, successors) = generator.sample_pairs(rows, &config.generator, &members, target)?;
-            let finisher = Finisher {
-                units: &generator.units,
-                models: &models,
-                filter: &config.filter,
-                terminal: config.labels.terminal,
-                agent: inputs.agent,
-            };
+            let finisher = Finisher::new(&generator.units, &models, config, inputs);
             let per_member = rows * generator.units.live.len();
             let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
             let finished = finisher.finish(&pairs)?;

@@ -165,9 +165,9 @@ impl Generator {
         target: &Transitions,
     ) -> Result<Vec<f32>> {
         let labels: Vec<f32> = members.iter().flat_map(|m| uniform_labels(m, "state", rows, y_max)).collect();
-        let start = self.start_rows(&self.units.states(&target.observations), rows, members, "state");
+        let start = self.start_rows(|| self.units.states(&target.observations), rows, members, "state");
         let progress = progress("sample states", rows * members.len(), sampler);
-        let request = Request { name: "state", rows, condition: &labels, start: Some(&start) };
+        let request = Request { name: "state", rows, condition: &labels, start: start.as_deref() };
         let mut states = self.state.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.state.invert_in_place(&mut states);
@@ -185,13 +185,13 @@ impl Generator {
         let d = self.units.live.len();
         let rows = states.len() / (d * members.len());
         let condition = self.units.state.apply(states);
-        let outputs = {
+        let outputs = || {
             let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
             self.units.output.apply(&self.units.target.encode(&s, &s2))
         };
-        let start = self.start_rows(&outputs, rows, members, "successor");
+        let start = self.start_rows(outputs, rows, members, "successor");
         let progress = progress("sample successors", rows * members.len(), sampler);
-        let request = Request { name: "successor", rows, condition: &condition, start: Some(&start) };
+        let request = Request { name: "successor", rows, condition: &condition, start: start.as_deref() };
         let mut out = self.transition.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.output.invert_in_place(&mut out);
@@ -199,12 +199,19 @@ impl Generator {
         Ok(out)
     }
 
-    /// Training rows for processes that start at data; drawn in any case, since they are cheap.
-    fn start_rows(&self, training: &[f32], rows: usize, members: &[Streams], name: &str) -> Vec<f32> {
+    /// Training rows for processes that start at data; the others need none.
+    fn start_rows(
+        &self,
+        training: impl FnOnce() -> Vec<f32>,
+        rows: usize,
+        members: &[Streams],
+        name: &str,
+    ) -> Option<Vec<f32>> {
         use rand::RngExt;
         if !self.state.process().starts_at_data() {
-            return vec![0.0; rows * members.len() * self.units.live.len()];
+            return None;
         }
+        let training = training();
         let d = self.units.live.len();
         let n = training.len() / d;
         let mut out = Vec::with_capacity(rows * members.len() * d);
@@ -215,7 +222,7 @@ impl Generator {
                 out.extend_from_slice(&training[i * d..(i + 1) * d]);
             }
         }
-        out
+        Some(out)
     }
 
     /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, y_max) and their successors.

@@ -119,13 +119,7 @@ impl GeneratorArgs {
         for process in processes {
             let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
             let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.data.out, &device)?;
-            let finisher = Finisher {
-                units: &generator.units,
-                models: &models,
-                filter: &config.filter,
-                terminal: config.labels.terminal,
-                agent: inputs.agent,
-            };
+            let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
             if floors.is_none() {
                 let units = &generator.units;
                 let d = units.live.len();
