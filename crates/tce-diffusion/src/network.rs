@@ -9,7 +9,7 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Activation, Dense, Device, Mlp, MlpConfig, dense, host, tensor};
+use tce_nn::{Activation, Dense, Device, Mlp, MlpConfig, ResidualStack, dense, host, tensor};
 
 use crate::DiffusionError;
 
@@ -128,9 +128,11 @@ impl ScoreNetwork {
         };
         let zero = Tensor::zeros([p, 1, width], &device);
         let embedded = self.condition.forward(condition);
+        let row_weight = part(0, dims);
         BoundNetwork {
             network: self,
-            row_weight: part(0, dims),
+            stack: ResidualStack::pack(row_weight.clone(), &self.blocks, &self.output),
+            row_weight,
             time_weight: part(dims, embedding),
             condition: dense(embedded, part(dims + embedding, embedding), zero, Activation::Identity),
         }
@@ -138,9 +140,10 @@ impl ScoreNetwork {
 }
 
 /// A [`ScoreNetwork`] with its conditions put in; see [`ScoreNetwork::bind`].
-#[derive(Debug)]
 pub struct BoundNetwork<'a> {
     network: &'a ScoreNetwork,
+    /// The fused trunk, on the CPU.
+    stack: Option<ResidualStack>,
     row_weight: Tensor<3>,
     time_weight: Tensor<3>,
     /// `[P, B, width]`
@@ -153,6 +156,14 @@ impl BoundNetwork<'_> {
         let time = tensor(vec![time as f32], [1, 1, 1], &x.device());
         let embedded = self.network.time.forward(time);
         let bias = dense(embedded, self.time_weight.clone(), self.network.input.bias.val(), Activation::Identity);
+        match &self.stack {
+            Some(stack) => stack.forward(x, bias, self.condition.clone()),
+            None => self.trunk(x, bias),
+        }
+    }
+
+    /// The same as a composition of layers.
+    fn trunk(&self, x: Tensor<3>, bias: Tensor<3>) -> Tensor<3> {
         let h = dense(x, self.row_weight.clone(), bias, Activation::Identity) + self.condition.clone();
         self.network.trunk(h)
     }

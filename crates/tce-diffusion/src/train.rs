@@ -1,14 +1,11 @@
 //! Training by denoising score matching (B.2, B.6): Adam on ‖F − target‖², one set of tensors for the whole population.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
 use tce_base::{Progress, Streams, interrupted};
-use tce_nn::{
-    Adam, AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, cosine_decay, host, moving_average, tensor,
-};
+use tce_nn::{Averaged, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host, tensor};
 
 use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
 
@@ -91,9 +88,8 @@ pub struct Trainer {
     config: TrainConfig,
     members: Vec<Streams>,
     device: Device,
-    network: ScoreNetwork,
-    average: Option<ScoreNetwork>,
-    adam: Adam,
+    network: Trained<ScoreNetwork>,
+    average: Option<Averaged<ScoreNetwork>>,
     step: u64,
 }
 
@@ -119,10 +115,9 @@ impl Trainer {
         }
         let device = device.clone().autodiff();
         let network = spec.init(members, name, &device);
-        let average = (config.ema > 0.0).then(|| network.valid());
-        let adam = AdamConfig::default().init();
-        let (name, members) = (name.to_owned(), members.to_vec());
-        Ok(Self { name, spec, process, config, members, device, network, average, adam, step: 0 })
+        let average = (config.ema > 0.0).then(|| Averaged::new(&network));
+        let (name, members, network) = (name.to_owned(), members.to_vec(), Trained::new(network));
+        Ok(Self { name, spec, process, config, members, device, network, average, step: 0 })
     }
 
     /// Steps taken.
@@ -192,18 +187,17 @@ impl Trainer {
 
     /// One step of Adam; the loss of each member, `[P, 1, 1]`.
     fn step(&mut self, data: &[ScoreData], steps: u64) -> Tensor<3> {
-        let loss = denoising_loss(&self.network, self.batch(data));
+        let loss = denoising_loss(self.network.net(), self.batch(data));
         let detached = loss.clone().inner();
-        let mut grads = loss.sum().backward();
         let rate = match self.config.schedule {
             Schedule::Constant => self.config.learning_rate,
             Schedule::Cosine => cosine_decay(self.config.learning_rate, self.step, steps),
         };
-        self.network = self.adam.step(rate, self.network.clone(), &mut grads);
-        if let Some(average) = self.average.take() {
+        self.network.step(loss.sum(), rate);
+        if let Some(average) = &mut self.average {
             let t = self.step as f64;
             let keep = self.config.ema.min((1.0 + t) / (10.0 + t));
-            self.average = Some(moving_average(average, &self.network, 1.0 - keep));
+            average.follow(self.network.net(), 1.0 - keep);
         }
         self.step += 1;
         detached
@@ -238,23 +232,21 @@ impl Trainer {
 
     /// The model as it is: the moving average if there is one.
     pub fn model(&self) -> ScoreModel {
-        let network = self.average.clone().unwrap_or_else(|| self.network.valid());
+        let network = match &self.average {
+            Some(average) => average.net().clone(),
+            None => self.network.net().valid(),
+        };
         ScoreModel::new(self.spec, self.process, network)
     }
 
     /// Everything a continuation needs besides the arguments of [`Trainer::new`].
     pub fn state(&self) -> NamedParameters {
         let mut out = NamedParameters::default();
-        out.collect("network", &self.network);
+        self.network.save("network", &mut out);
         if let Some(average) = &self.average {
-            out.collect("average", average);
+            out.collect("average", average.net());
         }
-        for (i, (m, v)) in self.adam.state().1.iter().enumerate() {
-            for (name, t) in [("m", m), ("v", v)] {
-                out.tensors.insert(format!("adam.{name}.{i}"), (t.dims().to_vec(), host(t.clone())));
-            }
-        }
-        out.metadata = BTreeMap::from([("step".to_owned(), self.step.to_string())]);
+        out.metadata.insert("step".to_owned(), self.step.to_string());
         out
     }
 
@@ -264,27 +256,15 @@ impl Trainer {
     /// # Errors
     /// If the state belongs to another training.
     pub fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), DiffusionError> {
-        let format = |reason: &str| NetworkError::Format { path: path.to_owned(), reason: reason.to_owned() };
         let step = state.metadata.get("step").and_then(|s| s.parse().ok());
-        let step: u64 = step.ok_or_else(|| format("the metadata has no 'step': no state of a training"))?;
-        let network = state.apply("network", self.network.clone(), path)?;
-        let average = self.average.clone().map(|a| state.apply("average", a, path)).transpose()?;
-        let plain = self.device.clone().inner();
-        let mut moments = Vec::new();
-        let moment = |name: &str, i: usize| {
-            let (shape, data) = state.tensors.get(&format!("adam.{name}.{i}"))?;
-            let flat = tensor(data.clone(), [1, 1, data.len()], &plain);
-            (shape.len() == 1).then(|| flat.reshape([data.len()]))
-        };
-        while let (Some(m), Some(v)) = (moment("m", moments.len()), moment("v", moments.len())) {
-            moments.push((m, v));
+        self.step = step.ok_or_else(|| NetworkError::Format {
+            path: path.to_owned(),
+            reason: "the metadata has no 'step': no state of a training".to_owned(),
+        })?;
+        self.network.load("network", state, path)?;
+        if let Some(average) = &mut self.average {
+            average.load("average", state, path)?;
         }
-        let wanted = state.tensors.keys().filter(|k| k.starts_with("network.")).count();
-        if step > 0 && moments.len() != wanted {
-            return Err(format("the optimiser's moments are missing").into());
-        }
-        self.adam.restore(step as i32, moments);
-        (self.network, self.average, self.step) = (network, average, step);
         Ok(())
     }
 }

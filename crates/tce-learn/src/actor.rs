@@ -22,13 +22,15 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::module::Param;
-use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, cosine_decay, host};
+use tce_nn::{
+    Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host,
+};
 
 use crate::buffer::Buffer;
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, normal_log_prob, squared_error};
 use crate::policy::{Head, LOG_STD_RANGE, Policy, PolicySpec, from_population};
-use crate::training::{Trained, member_noise};
+use crate::training::member_noise;
 
 /// Range of a state-independent ln σ.
 const FREE_LOG_STD_RANGE: (f32, f32) = (-5.0, 2.0);

@@ -20,13 +20,13 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor};
+use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::blocks::map_rows;
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::losses::{kl_to_standard_normal, member_mean, squared_error};
-use crate::training::{Learner, Meter, Steps, Trained, member_noise, train};
+use crate::training::{Learner, Meter, Steps, member_noise, train};
 
 /// Range of the posterior's ln σ.
 const LOG_STD_RANGE: (f32, f32) = (-4.0, 15.0);

@@ -33,9 +33,9 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use tce_nn::{Device, Mlp, MlpConfig, NamedParameters, NetworkError, Tensor, host};
+use tce_nn::{Averaged, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host};
 
-use crate::actor::{Actor, ActorConfig, PolicyForm};
+use crate::actor::{Actor, ActorConfig, PolicyForm, PolicyOutput};
 use crate::buffer::{Buffer, Minibatch, RewardScale};
 use crate::error::{LearnError, within};
 use crate::losses::{
@@ -43,7 +43,7 @@ use crate::losses::{
 };
 use crate::policy::Policy;
 use crate::regulariser::{Regulariser, RegulariserKind};
-use crate::training::{Averaged, Learner, Meter, PolicyLearner, Trained};
+use crate::training::{Learner, Meter, PolicyLearner};
 
 /// A weight below this does not move a policy.
 const DEAD_WEIGHT: f32 = 0.01;
@@ -194,72 +194,88 @@ impl Iql {
 
     /// One update of all networks. `critic_weights` `[P, B, 1]` multiply the rows of L_Q.
     pub fn step(&mut self, batch: &Minibatch, critic_weights: Option<Tensor<3>>, step: u64, meter: &mut Meter) {
+        let Self { config, actor, value, critic, target, regulariser } = self;
         let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
-        let u = self.value_step(batch, &sa, meter);
-        self.critic_step(batch, sa, critic_weights, meter);
-        self.policy_step(batch, u, step, meter);
-    }
-
-    /// L_V. Returns u of before the step.
-    fn value_step(&mut self, batch: &Minibatch, sa: &Tensor<3>, meter: &mut Meter) -> Tensor<3> {
-        let q = twin_min(self.target.net().forward(sa.clone()));
-        let v = self.value.net().forward(batch.s.clone());
-        if meter.active() {
-            meter.record("value_magnitude", &v.clone().inner().abs());
-        }
-        let difference = q - v;
+        // Value and policy meet in u only: where there are two threads, they are computed side by side. The twin critics
+        // are, too (as members of one layer, see `tce-nn`).
+        let q = twin_min(target.net().forward(sa.clone()));
+        let (v, output) = rayon::join(|| value.net().forward(batch.s.clone()), || actor.forward(batch.s.clone()));
+        let difference = q - v.clone();
         let u = difference.clone().inner();
-        let loss = expectile_loss(difference, self.config.expectile);
-        meter.record("value_loss", &loss);
-        self.value.step(loss.sum(), self.config.critic_lr);
-        u
-    }
-
-    /// L_Q and the moving average.
-    fn critic_step(&mut self, batch: &Minibatch, sa: Tensor<3>, weights: Option<Tensor<3>>, meter: &mut Meter) {
-        let next = self.value.net().forward(batch.s2.clone()).inner();
-        let y = batch.r.clone() + batch.not_done.clone() * next * self.config.discount;
-        let loss = twin_squared_error(self.critic.net().forward(sa), y, weights);
+        let mut policy_meter = meter.fork();
+        let (y, ()) = rayon::join(
+            || {
+                meter.record("value_magnitude", &v.inner().abs());
+                value_step(config, value, difference, batch, meter)
+            },
+            || policy_step(config, actor, regulariser, output, batch, u, step, &mut policy_meter),
+        );
+        meter.join(policy_meter);
+        let loss = twin_squared_error(critic.net().forward(sa), y, critic_weights);
         meter.record("critic_loss", &loss);
-        self.critic.step(loss.sum(), self.config.critic_lr);
-        self.target.follow(self.critic.net(), self.config.polyak);
+        critic.step(loss.sum(), config.critic_lr);
+        target.follow(critic.net(), config.polyak);
     }
+}
 
-    /// L_π.
-    fn policy_step(&mut self, batch: &Minibatch, u: Tensor<3>, step: u64, meter: &mut Meter) {
-        let c = &self.config;
-        let weights = AdvantageWeights { temperature: c.temperature, cap: c.weight_cap, scale: c.advantage };
-        let mut w = advantage_weights(u.clone(), weights);
-        if meter.active() {
-            let members = w.dims()[0];
-            let rows = w.dims()[1] as f64;
-            let (values, cap) = (host(w.clone()), c.weight_cap as f32);
-            let share = |test: &dyn Fn(f32) -> bool| -> Vec<f64> {
-                let count = |of: &[f32]| of.iter().filter(|&&w| test(w)).count() as f64 / rows;
-                values.chunks(values.len() / members).map(count).collect()
-            };
-            meter.add("weight_capped", share(&|w| w >= cap));
-            meter.add("weight_dead", share(&|w| w < DEAD_WEIGHT));
-            meter.record("weight_mean", &w);
-            meter.record("advantage_mean", &u);
-            let deviation = u.clone() - u.mean_dim(1);
-            meter.record("advantage_std", &deviation.square().mean_dim(1).sqrt());
-        }
-        if c.policy_extraction == PolicyExtraction::MeanWeight {
-            w = member_mean(w);
-        }
-        let output = self.actor.forward(batch.s.clone());
-        let mut loss = self.actor.imitation_loss(&output, batch.a.clone(), Some(w));
-        meter.record("policy_loss", &loss);
-        if c.beta_reg > 0.0
-            && let Some(term) = self.regulariser.loss(&self.actor, &output, batch, step)
-        {
-            meter.record("regulariser", &term);
-            loss = loss + term * c.beta_reg;
-        }
-        drop(output);
-        self.actor.step(loss, step);
+/// A step down L_V. Returns y, of V after the step.
+fn value_step(
+    config: &IqlConfig,
+    value: &mut Trained<Mlp>,
+    difference: Tensor<3>,
+    batch: &Minibatch,
+    meter: &mut Meter,
+) -> Tensor<3> {
+    let loss = expectile_loss(difference, config.expectile);
+    meter.record("value_loss", &loss);
+    value.step(loss.sum(), config.critic_lr);
+    // Outside of autodiff: nothing of the forward pass needs to be kept.
+    let next = value.net().valid().forward(batch.s2.clone());
+    batch.r.clone() + batch.not_done.clone() * next * config.discount
+}
+
+/// A step down L_π.
+#[allow(clippy::too_many_arguments)]
+fn policy_step(
+    c: &IqlConfig,
+    actor: &mut Actor,
+    regulariser: &Regulariser,
+    output: PolicyOutput,
+    batch: &Minibatch,
+    u: Tensor<3>,
+    step: u64,
+    meter: &mut Meter,
+) {
+    let weights = AdvantageWeights { temperature: c.temperature, cap: c.weight_cap, scale: c.advantage };
+    let mut w = advantage_weights(u.clone(), weights);
+    if meter.active() {
+        let members = w.dims()[0];
+        let rows = w.dims()[1] as f64;
+        let (values, cap) = (host(w.clone()), c.weight_cap as f32);
+        let share = |test: &dyn Fn(f32) -> bool| -> Vec<f64> {
+            let count = |of: &[f32]| of.iter().filter(|&&w| test(w)).count() as f64 / rows;
+            values.chunks(values.len() / members).map(count).collect()
+        };
+        meter.add("weight_capped", share(&|w| w >= cap));
+        meter.add("weight_dead", share(&|w| w < DEAD_WEIGHT));
+        meter.record("weight_mean", &w);
+        meter.record("advantage_mean", &u);
+        let deviation = u.clone() - u.mean_dim(1);
+        meter.record("advantage_std", &deviation.square().mean_dim(1).sqrt());
     }
+    if c.policy_extraction == PolicyExtraction::MeanWeight {
+        w = member_mean(w);
+    }
+    let mut loss = actor.imitation_loss(&output, batch.a.clone(), Some(w));
+    meter.record("policy_loss", &loss);
+    if c.beta_reg > 0.0
+        && let Some(term) = regulariser.loss(actor, &output, batch, step)
+    {
+        meter.record("regulariser", &term);
+        loss = loss + term * c.beta_reg;
+    }
+    drop(output);
+    actor.step(loss, step);
 }
 
 /// Two networks per member, side by side.

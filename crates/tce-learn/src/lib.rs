@@ -35,4 +35,6 @@ pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, train_labels};
 pub use policy::{Head, LOG_STD_RANGE, Policy, PolicySpec};
 pub use regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
-pub use training::{Averaged, Learner, Meter, Outcome, PolicyLearner, Report, Steps, Trained, member_noise, train};
+pub use training::{
+    Lane, Learner, Meter, Outcome, PolicyLearner, Report, Steps, member_noise, train, train_side_by_side,
+};

@@ -23,14 +23,13 @@ use tce_base::Streams;
 use tce_data::{Rows, Standardizer};
 use tce_nn::burn::tensor::activation;
 use tce_nn::{
-    Activation, Dense, Device, LayerNorm, Module, NamedParameters, NetworkError, Tensor, cosine_decay, tensor,
+    Activation, Dense, Device, LayerNorm, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, tensor,
 };
 
 use crate::blocks::map_rows;
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, squared_error};
-use crate::training::Trained;
 
 /// How the successor reaches the network.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -3,18 +3,20 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use rayon::prelude::*;
 use tce_base::{Progress, Streams, interrupted, random::fill_normal};
-use tce_nn::burn::tensor::TensorData;
-use tce_nn::{Adam, AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, host, moving_average, tensor};
+use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
 
 use crate::buffer::{Buffer, Minibatch};
 use crate::policy::Policy;
 
 /// Losses and other figures are taken every so many steps: they cost time, and their means need no more.
 const METER_EVERY: u64 = 10;
+/// Steps of a lane before the next one's turn.
+const TURN: u64 = 50;
 
 /// Something that is trained one minibatch at a time, P members at once.
-pub trait Learner {
+pub trait Learner: Send {
     /// One step. `step` counts from 0; figures go to `meter`.
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter);
 
@@ -43,104 +45,6 @@ pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 
     tensor(noise, shape, device)
 }
 
-/// A network and its optimiser.
-pub struct Trained<M> {
-    /// Empty only during a step.
-    net: Option<M>,
-    adam: Adam,
-}
-
-impl<M: Module> Trained<M> {
-    /// A network that has not seen a step, trained with Adam's default constants.
-    pub fn new(net: M) -> Self {
-        Self { net: Some(net), adam: AdamConfig::default().init() }
-    }
-
-    /// The network.
-    pub fn net(&self) -> &M {
-        self.net.as_ref().expect("only empty during a step")
-    }
-
-    /// One step of Adam down the gradient of `loss`, the sum over members of the members' losses.
-    ///
-    /// The loss is taken by value: a tensor that still holds the graph would make Adam copy the parameters.
-    pub fn step(&mut self, loss: Tensor<1>, lr: f64) {
-        let mut grads = loss.backward();
-        drop(loss);
-        let net = self.net.take().expect("only empty during a step");
-        self.net = Some(self.adam.step(lr, net, &mut grads));
-    }
-
-    /// Adds parameters and moments to `state`.
-    pub fn save(&self, name: &str, state: &mut NamedParameters) {
-        state.collect(name, self.net());
-        let (time, moments) = self.adam.state();
-        state.metadata.insert(format!("adam.{name}"), time.to_string());
-        for (k, (m, v)) in moments.iter().enumerate() {
-            for (part, t) in [("m", m), ("v", v)] {
-                state.tensors.insert(format!("adam.{name}.{part}.{k}"), (t.dims().to_vec(), host(t.clone())));
-            }
-        }
-    }
-
-    /// Takes parameters and moments from `state`.
-    pub fn load(&mut self, name: &str, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        let missing = |what: String, found: String| NetworkError::Mismatch {
-            path: path.to_owned(),
-            name: what,
-            found,
-            expected: "the optimiser's state".into(),
-        };
-        let key = format!("adam.{name}");
-        let found = state.metadata.get(&key).cloned().unwrap_or_else(|| "nothing".into());
-        let time = found.parse().map_err(|_| missing(key.clone(), found))?;
-        let net = self.net.take().expect("only empty during a step");
-        let net = self.net.insert(state.apply(name, net, path)?);
-        let device = net.devices()[0].clone().inner();
-        let moment = |part: &str, k: usize| -> Option<Tensor<1>> {
-            let (shape, data) = state.tensors.get(&format!("{key}.{part}.{k}"))?;
-            Some(Tensor::from_data(TensorData::new(data.clone(), shape.clone()), &device))
-        };
-        let mut moments = Vec::new();
-        while let (Some(m), Some(v)) = (moment("m", moments.len()), moment("v", moments.len())) {
-            moments.push((m, v));
-        }
-        self.adam.restore(time, moments);
-        Ok(())
-    }
-}
-
-/// A network that follows another one slowly (a target network, an average of the parameters).
-pub struct Averaged<M> {
-    /// Empty only while it moves.
-    net: Option<M>,
-}
-
-impl<M: Module> Averaged<M> {
-    /// A copy of `online`, outside of autodiff.
-    pub fn new(online: &M) -> Self {
-        // A moving average of rate 0 owns its memory, which a plain copy would share with `online`.
-        Self { net: Some(moving_average(online.valid(), online, 0.0)) }
-    }
-
-    /// The network.
-    pub fn net(&self) -> &M {
-        self.net.as_ref().expect("only empty while it moves")
-    }
-
-    /// θ' ← (1 - rate) θ' + rate θ.
-    pub fn follow(&mut self, online: &M, rate: f64) {
-        let net = self.net.take().expect("only empty while it moves");
-        self.net = Some(moving_average(net, online, rate));
-    }
-
-    /// Takes the parameters from `state`.
-    pub fn load(&mut self, name: &str, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.net = Some(state.apply(name, self.net().clone(), path)?);
-        Ok(())
-    }
-}
-
 /// Means of named figures, per member.
 #[derive(Debug, Default)]
 pub struct Meter {
@@ -157,6 +61,20 @@ impl Meter {
     /// Whether figures are wanted at this step; learners ask before they compute any.
     pub fn active(&self) -> bool {
         self.active
+    }
+
+    /// An empty meter that is as active, for work on another thread; [`Meter::join`] takes its figures back.
+    pub fn fork(&self) -> Self {
+        Self { active: self.active, ..Self::default() }
+    }
+
+    /// Takes the figures of a [`Meter::fork`].
+    pub fn join(&mut self, fork: Self) {
+        for (name, (values, count)) in fork.sums {
+            let (sum, n) = self.sums.entry(name).or_insert_with(|| (vec![0.0; values.len()], 0));
+            sum.iter_mut().zip(values).for_each(|(s, v)| *s += v);
+            *n += count;
+        }
     }
 
     /// Takes the mean over each member's entries of `value` `[P, ·, ·]`.
@@ -229,10 +147,18 @@ pub struct Outcome {
     pub interrupted: bool,
 }
 
-/// Trains `learner` on minibatches of `buffer`, with a progress bar named `label`.
+/// A learner and the rows it learns from.
+pub struct Lane<'a, L: ?Sized> {
+    /// The learner.
+    pub learner: &'a mut L,
+    /// Its rows.
+    pub buffer: &'a Buffer,
+}
+
+/// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one lane.
 ///
-/// `on_report` gets the means of the figures and the learner, to evaluate or save it; its error ends the training.
-/// The learner's device is the one of its parameters; batches are made on `device`.
+/// # Errors
+/// That of `on_report`.
 pub fn train<L: Learner + ?Sized, E>(
     learner: &mut L,
     buffer: &Buffer,
@@ -241,26 +167,77 @@ pub fn train<L: Learner + ?Sized, E>(
     device: &Device,
     mut on_report: impl FnMut(&Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    let progress = Progress::new(label, steps.to.saturating_sub(steps.from), "steps");
-    let mut meter = Meter::default();
-    for step in steps.from..steps.to {
+    train_side_by_side(&mut [Lane { learner, buffer }], steps, label, device, |_, report, l| on_report(report, l))
+}
+
+/// Trains the learners of all lanes, with one progress bar named `label`.
+///
+/// Lanes take the threads in turns of a few steps, so that three lanes keep two cores busy; what a lane learns does not
+/// depend on the others, nor on the number of threads. `on_report` gets the lane, the means of its figures and its learner,
+/// to evaluate or save it; its error ends the training. The learners' device is the one of their parameters; batches are
+/// made on `device`, each while the update before it runs.
+///
+/// # Errors
+/// That of `on_report`.
+pub fn train_side_by_side<L: Learner + ?Sized, E>(
+    lanes: &mut [Lane<L>],
+    steps: Steps,
+    label: &str,
+    device: &Device,
+    mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
+) -> Result<Outcome, E> {
+    let total = steps.to.saturating_sub(steps.from) * lanes.len() as u64;
+    let progress = Progress::new(label, total, "steps");
+    let mut runs: Vec<_> = lanes.iter_mut().map(|lane| Run { lane, meter: Meter::default(), next: None }).collect();
+    let mut step = steps.from;
+    while step < steps.to {
         if interrupted() {
             return Ok(Outcome { step, interrupted: true });
         }
-        meter.active = step % METER_EVERY == 0;
-        learner.update(&buffer.sample(step, device), step, &mut meter);
-        progress.inc(1);
-        let done = step + 1;
-        if done == steps.to || (steps.report_every > 0 && done % steps.report_every == 0) {
-            let report = Report { step: done, metrics: meter.take() };
-            for member in report.diverged() {
-                eprintln!("{label}: member {member} has diverged at step {done} (a loss is not finite)");
+        let due = match steps.report_every {
+            0 => steps.to,
+            every => ((step / every + 1) * every).min(steps.to),
+        };
+        let turn = step..due.min(step + TURN);
+        runs.par_iter_mut().for_each(|run| run.advance(turn.clone(), steps.to, device, &progress));
+        step = turn.end;
+        if step == due {
+            for (k, run) in runs.iter_mut().enumerate() {
+                let report = Report { step, metrics: run.meter.take() };
+                for member in report.diverged() {
+                    eprintln!("{label}: member {} has diverged at step {step} (a loss is not finite)", k + member);
+                }
+                on_report(k, &report, run.lane.learner)?;
             }
-            on_report(&report, learner)?;
         }
     }
     progress.finish();
     Ok(Outcome { step: steps.to.max(steps.from), interrupted: false })
+}
+
+/// A lane under way.
+struct Run<'a, 'b, L: ?Sized> {
+    lane: &'a mut Lane<'b, L>,
+    meter: Meter,
+    /// The batch of the next step.
+    next: Option<Minibatch>,
+}
+
+impl<L: Learner + ?Sized> Run<'_, '_, L> {
+    fn advance(&mut self, turn: std::ops::Range<u64>, end: u64, device: &Device, progress: &Progress) {
+        let Lane { learner, buffer } = self.lane;
+        for step in turn {
+            let batch = self.next.take().unwrap_or_else(|| buffer.sample(step, device));
+            self.meter.active = step % METER_EVERY == 0;
+            let meter = &mut self.meter;
+            let (_, next) = rayon::join(
+                || learner.update(&batch, step, meter),
+                || (step + 1 < end).then(|| buffer.sample(step + 1, device)),
+            );
+            self.next = next;
+            progress.inc(1);
+        }
+    }
 }
 
 #[cfg(test)]

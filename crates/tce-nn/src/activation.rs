@@ -1,7 +1,5 @@
 //! Activation functions, as a composition of burn operations and as loops the compiler vectorises.
 
-use std::mem::MaybeUninit;
-
 use burn::tensor::{Tensor, activation};
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
@@ -28,6 +26,17 @@ impl Activation {
             Activation::Relu => activation::relu(z),
             Activation::Silu => activation::silu(z),
             Activation::Tanh => activation::tanh(z),
+        }
+    }
+
+    /// z ← act(z), inlined into the kernels.
+    #[inline(always)]
+    pub(crate) fn apply(self, z: &mut [f32]) {
+        match self {
+            Activation::Identity => {}
+            Activation::Relu => z.iter_mut().for_each(|z| *z = z.max(0.0)),
+            Activation::Silu => z.iter_mut().for_each(|z| *z *= sigmoid(*z)),
+            Activation::Tanh => z.iter_mut().for_each(|z| *z = tanh(*z)),
         }
     }
 
@@ -73,52 +82,33 @@ fn tanh(x: f32) -> f32 {
     if x2 < 0.01 { small } else { large }
 }
 
-/// In place on rows of width `bias.len()`: z ← z + bias, kept (where given) ← z, z ← act(z).
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(crate) fn bias_and_activation(z: &mut [f32], bias: &[f32], act: Activation, kept: Option<&mut [MaybeUninit<f32>]>) {
-    let width = bias.len();
-    for row in z.chunks_exact_mut(width) {
-        for (z, b) in row.iter_mut().zip(bias) {
-            *z += b;
-        }
-    }
-    if let Some(kept) = kept {
-        kept.write_copy_of_slice(z);
-    }
-    match act {
-        Activation::Identity => {}
-        Activation::Relu => z.iter_mut().for_each(|z| *z = z.max(0.0)),
-        Activation::Silu => z.iter_mut().for_each(|z| *z *= sigmoid(*z)),
-        Activation::Tanh => z.iter_mut().for_each(|z| *z = tanh(*z)),
-    }
-}
-
 /// dz = dy · act'(·) where dy stands, and db = column sums of dz. `kept` is z for SiLU and the output y for the others.
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 pub(crate) fn activation_gradient(dz: &mut [f32], kept: &[f32], act: Activation, db: &mut [f32]) {
-    match act {
-        Activation::Identity => {}
-        Activation::Relu => {
-            for (dz, y) in dz.iter_mut().zip(kept) {
-                *dz = if *y > 0.0 { *dz } else { 0.0 };
-            }
-        }
-        Activation::Silu => {
-            for (dz, z) in dz.iter_mut().zip(kept) {
-                let s = sigmoid(*z);
-                *dz *= s * (1.0 + z * (1.0 - s));
-            }
-        }
-        Activation::Tanh => {
-            for (dz, y) in dz.iter_mut().zip(kept) {
-                *dz *= 1.0 - y * y;
-            }
-        }
-    }
     db.fill(0.0);
-    for row in dz.chunks_exact(db.len()) {
-        for (db, dz) in db.iter_mut().zip(row) {
-            *db += dz;
+    let width = db.len();
+    for (dz, kept) in dz.chunks_exact_mut(width).zip(kept.chunks_exact(width)) {
+        match act {
+            Activation::Identity => {}
+            Activation::Relu => {
+                for (dz, y) in dz.iter_mut().zip(kept) {
+                    *dz = if *y > 0.0 { *dz } else { 0.0 };
+                }
+            }
+            Activation::Silu => {
+                for (dz, z) in dz.iter_mut().zip(kept) {
+                    let s = sigmoid(*z);
+                    *dz *= s * (1.0 + z * (1.0 - s));
+                }
+            }
+            Activation::Tanh => {
+                for (dz, y) in dz.iter_mut().zip(kept) {
+                    *dz *= 1.0 - y * y;
+                }
+            }
+        }
+        for (db, dz) in db.iter_mut().zip(dz) {
+            *db += *dz;
         }
     }
 }

@@ -12,7 +12,7 @@ use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::Checkpoi
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, DispatchDevice, Flex, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, backend_extension};
 use burn::tensor::{DType, Shape as TensorShape, Tensor};
 use burn_flex::FlexTensor;
 
@@ -44,7 +44,7 @@ pub fn dense_composed(x: Tensor<3>, w: Tensor<3>, b: Tensor<3>, act: Activation)
 
 /// Whether the tensor lives on the CPU device that has the fused operations.
 pub(crate) fn is_flex<const D: usize>(t: &Tensor<D>) -> bool {
-    matches!(t.device().inner().as_dispatch(), DispatchDevice::Flex(_))
+    crate::is_cpu(&t.device())
 }
 
 /// The fused dense layer as an operation of a backend.

@@ -46,6 +46,11 @@ impl Dense {
         Self { weight: trainable(weight), bias: trainable(bias), activation }
     }
 
+    /// What follows the affine map.
+    pub(crate) fn activation(&self) -> Activation {
+        self.activation
+    }
+
     /// x `[P, B, I]` (or fewer members, see [`dense`]) → `[P, B, O]`.
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
         dense(x, self.weight.val(), self.bias.val(), self.activation)

@@ -8,21 +8,34 @@
 mod activation;
 mod adam;
 mod dense;
+mod gemm;
 mod kernels;
 mod layers;
 mod params;
+mod simd;
+mod stack;
 mod tensors;
+mod trained;
 
 pub use activation::Activation;
 pub use adam::{Adam, AdamConfig};
 pub use dense::{dense, dense_composed};
 pub use layers::{Dense, LayerNorm, Mlp, MlpConfig};
 pub use params::{NamedParameters, NetworkError, moving_average, parameter_count};
+pub use stack::ResidualStack;
 pub use tensors::{Batch, cosine_decay, host, tensor};
+
+pub use trained::{Averaged, Trained};
 
 pub use burn;
 pub use burn::module::Module;
 pub use burn::tensor::{Device, Tensor};
+
+/// Whether networks on `device` are computed by the CPU: there the members of a population gain nothing from being one
+/// set of tensors, and scale over cores as trainings of their own.
+pub fn is_cpu(device: &Device) -> bool {
+    matches!(device.clone().inner().as_dispatch(), burn::backend::DispatchDevice::Flex(_))
+}
 
 /// The CPU: burn's `flex` device, without autodiff.
 pub fn cpu() -> Device {

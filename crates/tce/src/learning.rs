@@ -1,17 +1,17 @@
 //! From data to policies: standardisation, the learner, its metrics, and the evaluation of every member.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{Agent, ReferenceScores, Shift, Standardizer, Transitions};
 use tce_learn::{
-    Bc, Buffer, Iql, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
-    return_range_scale, train,
+    Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
+    return_range_scale, train_side_by_side,
 };
-use tce_nn::Device;
+use tce_nn::{Device, is_cpu};
 
 use crate::actors::{Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
@@ -61,8 +61,8 @@ impl Learned {
     }
 }
 
-/// Learns one policy per member. Members are trained together, in as many groups as there are threads: a member's policy
-/// does not depend on its group, and groups scale where one training spread over cores does not (see `tce-nn`'s kernels).
+/// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
+/// policy is the same.
 pub fn learn(
     data: Vec<MemberData>,
     config: &LearnerConfig,
@@ -72,70 +72,33 @@ pub fn learn(
     device: &Device,
 ) -> Result<(Vec<Policy>, Learned)> {
     let started = std::time::Instant::now();
-    let groups = rayon::current_num_threads().min(data.len()).max(1);
-    let size = data.len().div_ceil(groups);
-    let metrics = Mutex::new(metrics);
-    let results: Vec<Result<(Vec<Policy>, Learned)>> = std::thread::scope(|scope| {
-        let group = |(k, data): (usize, &[MemberData])| {
-            let (data, metrics) = (data.to_vec(), &metrics);
-            scope.spawn(move || learn_group(data, k * size, config, evaluation, arena, metrics, device))
-        };
-        let threads: Vec<_> = data.chunks(size).enumerate().map(group).collect();
-        threads.into_iter().map(|t| t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
-    });
-    let (mut policies, mut learned) = (Vec::new(), Learned::default());
-    for result in results {
-        let (p, l) = result?;
-        policies.extend(p);
-        learned.evaluations.extend(l.evaluations);
-        for (name, values) in l.figures {
-            learned.figures.entry(name).or_default().extend(values);
-        }
-    }
-    learned.seconds = started.elapsed().as_secs_f64();
-    Ok((policies, learned))
-}
-
-/// Learns the policies of members `first..` of the whole population as one training.
-fn learn_group(
-    data: Vec<MemberData>,
-    first: usize,
-    config: &LearnerConfig,
-    evaluation: &EvaluationConfig,
-    arena: Option<Arena>,
-    metrics: &Mutex<&mut Metrics>,
-    device: &Device,
-) -> Result<(Vec<Policy>, Learned)> {
-    let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
+    let size = if is_cpu(device) { 1 } else { data.len().max(1) };
+    let lanes = data.par_chunks(size).map(|data| lane(data, config, device)).collect::<Result<Vec<_>>>()?;
     drop(data);
-    let buffer = Buffer::new(members, config.batch)?;
-    let mut learner: Box<dyn PolicyLearner> = match config.algorithm {
-        Algorithm::Bc => Box::new(Bc::new(&buffer, &config.bc, config.steps, device)?),
-        Algorithm::Iql => {
-            let regulariser = Regulariser::prepare(config.iql.regulariser, &buffer, &config.behaviour, device)?;
-            let regulariser = regulariser.ok_or(Error::Interrupted)?;
-            Box::new(Iql::new(&buffer, &config.iql, regulariser, config.steps, device)?)
-        }
-    };
-    let log = |stage: &str, step: u64, m: usize, values: Vec<(&str, f64)>| {
-        metrics.lock().unwrap_or_else(PoisonError::into_inner).log(stage, step, first + m, values)
-    };
-    let report_every = (config.steps / 50).max(1);
-    let mut learned = Learned::default();
-    let mut judged = 0;
-    let steps = Steps::new(config.steps, report_every);
+    let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
+    let mut lanes: Vec<_> =
+        learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
+    let steps = Steps::new(config.steps, (config.steps / 50).max(1));
     let label = format!("learn {} {seeds:?}", label(config.algorithm));
-    let outcome = train(learner.as_mut(), &buffer, steps, &label, device, |report, learner| {
-        for m in 0..seeds.len() {
-            log("learn", report.step, m, report.metrics.iter().map(|(&name, v)| (name, v[m])).collect())?;
+    let mut learned = Learned::default();
+    let due = |step: u64| step < config.steps && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
+    let mut judged = vec![0; lanes.len()];
+    let outcome = train_side_by_side(&mut lanes, steps, &label, device, |k, report, learner| {
+        for (m, _) in seeds.iter().enumerate().skip(k * size).take(size) {
+            let figures = report.metrics.iter().map(|(&name, v)| (name, v[m - k * size]));
+            metrics.log("learn", report.step, m, figures)?;
         }
-        learned.figures = report.metrics.iter().map(|(&k, v)| (k.to_owned(), v.clone())).collect();
-        let due = report.step.checked_div(evaluation.every).unwrap_or(0);
-        if let (Some(arena), true, true) = (arena, due > judged, report.step < config.steps) {
-            judged = due;
-            for (m, e) in judge(&learner.policies(), &seeds, evaluation.episodes, arena)?.iter().enumerate() {
-                log("evaluate", report.step, m, e.score.map(|s| ("score", s)).into_iter().collect())?;
+        for (&name, values) in &report.metrics {
+            let figures = learned.figures.entry(name.to_owned()).or_insert_with(|| vec![f64::NAN; seeds.len()]);
+            figures[k * size..][..values.len()].copy_from_slice(values);
+        }
+        let number = report.step.checked_div(evaluation.every).unwrap_or(0);
+        if let (Some(arena), true) = (arena, due(report.step) && number > judged[k]) {
+            judged[k] = number;
+            let evaluations = judge(&learner.policies(), &seeds[k * size..], evaluation.episodes, arena)?;
+            for (m, e) in evaluations.iter().enumerate() {
+                metrics.log("evaluate", report.step, k * size + m, e.score.map(|s| ("score", s)))?;
             }
         }
         Ok::<_, Error>(())
@@ -143,14 +106,30 @@ fn learn_group(
     if outcome.interrupted {
         return Err(Error::Interrupted);
     }
-    let policies = learner.policies();
+    let policies: Vec<Policy> = learners.iter().flat_map(|l| l.policies()).collect();
     if let Some(arena) = arena {
         learned.evaluations = judge(&policies, &seeds, evaluation.episodes, arena)?;
         for (m, e) in learned.evaluations.iter().enumerate() {
-            log("evaluate", config.steps, m, e.score.map(|s| ("score", s)).into_iter().collect())?;
+            metrics.log("evaluate", config.steps, m, e.score.map(|s| ("score", s)))?;
         }
     }
+    learned.seconds = started.elapsed().as_secs_f64();
     Ok((policies, learned))
+}
+
+/// The members of `data` as one training, before its first step.
+fn lane(data: &[MemberData], config: &LearnerConfig, device: &Device) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
+    let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
+    let buffer = Buffer::new(members, config.batch)?;
+    let learner: Box<dyn PolicyLearner> = match config.algorithm {
+        Algorithm::Bc => Box::new(Bc::new(&buffer, &config.bc, config.steps, device)?),
+        Algorithm::Iql => {
+            let regulariser = Regulariser::prepare(config.iql.regulariser, &buffer, &config.behaviour, device)?;
+            let regulariser = regulariser.ok_or(Error::Interrupted)?;
+            Box::new(Iql::new(&buffer, &config.iql, regulariser, config.steps, device)?)
+        }
+    };
+    Ok((buffer, learner))
 }
 
 fn label(algorithm: Algorithm) -> &'static str {
