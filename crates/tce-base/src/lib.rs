@@ -6,5 +6,5 @@ pub mod progress;
 pub mod random;
 
 pub use files::{AtomicFile, FileError, sha256_file, sha256_hex, write_atomically, write_json};
-pub use progress::{Progress, interrupted, listen_for_interrupts};
+pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
 pub use random::{Rng, Streams};

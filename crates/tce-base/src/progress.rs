@@ -17,6 +17,7 @@ pub struct Progress {
     total: u64,
     bar: Option<ProgressBar>,
     started: Instant,
+    quiet: bool,
     plain: Mutex<Plain>,
 }
 
@@ -30,7 +31,8 @@ impl Progress {
     /// Starts a bar for `total` units of `unit` ("rows", "steps").
     pub fn new(label: impl Into<String>, total: u64, unit: &'static str) -> Self {
         let label = label.into();
-        let bar = std::io::stderr().is_terminal().then(|| {
+        let quiet = QUIET.load(Ordering::Relaxed);
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
             let style = "{prefix:<22} {bar:30} {human_pos}/{human_len} {per_sec:>12} {eta:>5} {msg}";
             let bar = ProgressBar::new(total).with_prefix(label.clone());
             bar.set_style(ProgressStyle::with_template(style).expect("a constant template"));
@@ -43,6 +45,7 @@ impl Progress {
             total,
             bar,
             started: now,
+            quiet,
             plain: Mutex::new(Plain { done: 0, last: now, message: String::new() }),
         }
     }
@@ -55,7 +58,7 @@ impl Progress {
         }
         let mut plain = self.plain.lock().expect("progress is never poisoned");
         plain.done += n;
-        if plain.last.elapsed() >= PLAIN_INTERVAL {
+        if !self.quiet && plain.last.elapsed() >= PLAIN_INTERVAL {
             plain.last = Instant::now();
             let seconds = self.started.elapsed().as_secs_f64();
             let rate = plain.done as f64 / seconds;
@@ -88,7 +91,9 @@ impl Progress {
         }
         let seconds = self.started.elapsed().as_secs_f64();
         let rate = self.total as f64 / seconds.max(1e-9);
-        eprintln!("{}: {} {} in {} ({:.0}/s)", self.label, self.total, self.unit, duration(seconds), rate);
+        if !self.quiet {
+            eprintln!("{}: {} {} in {} ({:.0}/s)", self.label, self.total, self.unit, duration(seconds), rate);
+        }
         seconds
     }
 }
@@ -99,6 +104,13 @@ fn duration(seconds: f64) -> String {
         s if s < 5400.0 => format!("{:.0} min {:02.0} s", (s / 60.0).floor(), s % 60.0),
         s => format!("{:.1} h", s / 3600.0),
     }
+}
+
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Whether progress that starts from now on is shown at all.
+pub fn set_quiet(quiet: bool) {
+    QUIET.store(quiet, Ordering::Relaxed);
 }
 
 fn flag() -> &'static Arc<AtomicBool> {

@@ -7,15 +7,18 @@
 //! `gemm` crate, whose kernels are as fast: packing, the separate passes for bias and activation, and narrow layers were a
 //! third of an IQL update (`bench/speed.md`), and weights that many batches share can be packed once here.
 //!
-//! Every element is one sum over k in ascending order, one fused multiply-add a term: the bits depend neither on the
-//! width of the vectors nor on how work is cut.
+//! Every element is one sum over k in ascending order, one fused multiply-add a term (sixteen interleaved sums where b has
+//! few columns): the bits depend neither on the width of the vectors nor on how work is cut.
 
 use std::cell::RefCell;
 use std::mem::MaybeUninit;
 use std::sync::OnceLock;
 
 use crate::activation::Activation;
-use crate::simd::{Portable, Simd};
+use crate::simd::Portable;
+use kernel::{dots, drive};
+
+mod kernel;
 
 /// Memory for results that are written before they are read: zeroing it first was a tenth of an IQL update.
 pub(crate) type Uninit = [MaybeUninit<f32>];
@@ -24,6 +27,9 @@ pub(crate) type Uninit = [MaybeUninit<f32>];
 const TERMS: usize = 320;
 /// Rows of a per pass: they fit the second-level cache beside b.
 const ROWS: usize = 128;
+
+/// Most columns of a right operand that are multiplied row by column: as many sums as the registers hold.
+const DOTS: usize = 6;
 
 /// A matrix in memory: first element, and the distance between rows and between columns.
 #[derive(Clone, Copy)]
@@ -165,7 +171,7 @@ impl Packed {
     pub fn new(b: Matrix, k: usize, n: usize) -> Self {
         assert!(b.holds(k, n));
         let isa = Isa::best();
-        let mut data = vec![0.0; n.div_ceil(isa.panel(n)) * isa.panel(n) * k];
+        let mut data = vec![0.0; n.div_ceil(isa.panel(n)) * (isa.panel(n) * k + 16 * k.div_ceil(TERMS))];
         let job = Job { m: 1, n, k, a: b.view(), b: b.view(), packed: std::ptr::null(), out: std::ptr::null_mut() };
         // SAFETY: the matrix holds what is read, and `data` has room for all panels.
         unsafe { run(isa, &job, &Finish::Store, Scratch { b: data.as_mut_ptr(), a: std::ptr::null_mut() }, true) };
@@ -201,7 +207,7 @@ fn product_on(isa: Isa, out: &mut Uninit, a: Matrix, b: Right, [m, k, n]: [usize
         }
     };
     SCRATCH.with_borrow_mut(|scratch| {
-        let packed_b = (n.max(m) + 32) * k.min(TERMS);
+        let packed_b = ((n.max(m) + 32) * (k.min(TERMS) + 16)).max(DOTS * k);
         let packed_a = (ROWS + 16) * TERMS;
         // A narrow product is turned over: its result passes through here.
         let turned = m.min(n) * m.max(n);
@@ -227,7 +233,14 @@ fn product_on(isa: Isa, out: &mut Uninit, a: Matrix, b: Right, [m, k, n]: [usize
                     *to = if add { *to + z } else { z };
                 }
             } else {
-                run(isa, &job, &finish, scratch, false);
+                match (isa, packed.is_null() && a.column == 1 && n <= DOTS) {
+                    (Isa::Portable, true) => dots_portable(&job, &finish, scratch.b),
+                    #[cfg(target_arch = "x86_64")]
+                    (Isa::Avx2, true) => dots_avx2(&job, &finish, scratch.b),
+                    #[cfg(target_arch = "x86_64")]
+                    (Isa::Avx512, true) => dots_avx512(&job, &finish, scratch.b),
+                    _ => run(isa, &job, &finish, scratch, false),
+                }
             }
         }
     });
@@ -281,243 +294,36 @@ macro_rules! kernel {
     };
 }
 
+/// [`dots`] for as many columns as there are, at most [`DOTS`].
+macro_rules! dots {
+    ($name:ident, $vector:ty, $vectors:literal, $(#[$attribute:meta])*) => {
+        $(#[$attribute])*
+        unsafe fn $name(job: &Job, finish: &Finish, columns: *mut f32) {
+            // SAFETY: the caller's.
+            unsafe {
+                match job.n {
+                    1 => dots::<$vector, 1, $vectors>(job, finish, columns),
+                    2 => dots::<$vector, 2, $vectors>(job, finish, columns),
+                    3 => dots::<$vector, 3, $vectors>(job, finish, columns),
+                    4 => dots::<$vector, 4, $vectors>(job, finish, columns),
+                    5 => dots::<$vector, 5, $vectors>(job, finish, columns),
+                    _ => dots::<$vector, 6, $vectors>(job, finish, columns),
+                }
+            }
+        }
+    };
+}
+
+dots!(dots_portable, Portable, 2,);
+dots!(dots_avx2, std::arch::x86_64::__m256, 2, #[cfg(target_arch = "x86_64")] #[target_feature(enable = "avx2,fma")]);
+dots!(dots_avx512, std::arch::x86_64::__m512, 1,
+    #[cfg(target_arch = "x86_64")] #[target_feature(enable = "avx512f,avx2,fma")]);
+
 // Sums in registers: 12 of 16 with AVX2, 24 of 32 with AVX-512.
 kernel!(avx2, "avx2,fma", std::arch::x86_64::__m256, 6, 2, 16);
 kernel!(avx2_narrow, "avx2,fma", std::arch::x86_64::__m256, 12, 1, 8);
 kernel!(avx512, "avx512f,avx2,fma", std::arch::x86_64::__m512, 12, 2, 32);
 kernel!(avx512_narrow, "avx512f,avx2,fma", std::arch::x86_64::__m512, 12, 1, 16);
-
-/// The loops around the micro-kernel.
-#[inline(always)]
-unsafe fn drive<V: Simd, const MR: usize, const NV: usize, const NR: usize>(
-    job: &Job,
-    finish: &Finish,
-    scratch: Scratch,
-    pack_only: bool,
-) {
-    let &Job { m, n, k, a, b, packed, out } = job;
-    let terms = k.div_ceil(k.div_ceil(TERMS));
-    let rows = m.div_ceil(m.div_ceil(ROWS)).div_ceil(MR) * MR;
-    let panels = n.div_ceil(NR);
-    // Few rows of a read b once or twice: packing it would cost more than it saves.
-    let direct = packed.is_null() && !pack_only && b.column == 1 && m <= MR;
-    // SAFETY: the caller's; every index stays below m, n and k.
-    unsafe {
-        for k0 in (0..k).step_by(terms) {
-            let count = terms.min(k - k0);
-            let whole = panels * NR * k0;
-            let own = if pack_only { scratch.b.add(whole) } else { scratch.b };
-            if packed.is_null() {
-                // The last panel of a direct operand may be a partial one, which the kernel cannot read.
-                let from = if direct { n / NR } else { 0 };
-                for j in from..panels {
-                    pack_right::<V, NR>(b.from(k0, j * NR), count, NR.min(n - j * NR), own.add(j * NR * count));
-                }
-            }
-            if pack_only {
-                continue;
-            }
-            let ready = if packed.is_null() { own.cast_const() } else { packed.add(whole) };
-            let add = k0 > 0 || matches!(finish, Finish::Add);
-            let last = k0 + count == k;
-            for m0 in (0..m).step_by(rows) {
-                let height = rows.min(m - m0);
-                let block = a.from(m0, k0);
-                if a.column != 1 {
-                    pack_left::<MR>(block, height, count, scratch.a);
-                }
-                for j in 0..panels {
-                    let width = NR.min(n - j * NR);
-                    let (b, b_row) = match direct && width == NR {
-                        true => (b.at(k0, j * NR), b.row),
-                        false => (ready.add(j * NR * count), NR),
-                    };
-                    for i in (0..height).step_by(MR) {
-                        let count_rows = MR.min(height - i);
-                        let at = (m0 + i) * n + j * NR;
-                        let (a, a_row, a_column) = match a.column != 1 {
-                            true => (scratch.a.add(i * count).cast_const(), 1, count_rows),
-                            false => (block.at(i, 0), block.row, 1),
-                        };
-                        if width == NR {
-                            tiles::<V, MR, NV>(count_rows, count, a, a_row, a_column, b, b_row, out.add(at), n, add);
-                        } else {
-                            let mut edge = [[0.0f32; NR]; MR];
-                            let edge: *mut f32 = edge.as_mut_ptr().cast();
-                            let copy = |from: *const f32, step: usize, to: *mut f32, to_step: usize| {
-                                for r in 0..count_rows {
-                                    std::ptr::copy_nonoverlapping(from.add(r * step), to.add(r * to_step), width);
-                                }
-                            };
-                            if add {
-                                copy(out.add(at), n, edge, NR);
-                            }
-                            tiles::<V, MR, NV>(count_rows, count, a, a_row, a_column, b, b_row, edge, NR, add);
-                            copy(edge, NR, out.add(at), n);
-                        }
-                        if last && let Finish::Activate { bias, act, kept, skip } = *finish {
-                            let bias = bias.as_ptr().add(j * NR);
-                            for r in 0..count_rows {
-                                let at = at + r * n;
-                                let kept = if kept.is_null() { kept } else { kept.add(at) };
-                                let skip = skip.map_or(std::ptr::null(), |s| s.as_ptr().add(at));
-                                // A width the compiler knows makes whole vectors of the row.
-                                let width = if width == NR { NR } else { width };
-                                activate(out.add(at), bias, kept, skip, width, act);
-                            }
-                        }
-                    }
-                }
-            }
-        }
-    }
-}
-
-#[inline(always)]
-unsafe fn activate(z: *mut f32, bias: *const f32, kept: *mut f32, skip: *const f32, width: usize, act: Activation) {
-    // SAFETY: the caller's: `width` numbers each, and no two of them overlap.
-    let (z, bias) = unsafe { (std::slice::from_raw_parts_mut(z, width), std::slice::from_raw_parts(bias, width)) };
-    for (z, b) in z.iter_mut().zip(bias) {
-        *z += b;
-    }
-    if !kept.is_null() {
-        // SAFETY: as above.
-        unsafe { std::ptr::copy_nonoverlapping(z.as_ptr(), kept, width) };
-    }
-    act.apply(z);
-    if !skip.is_null() {
-        // SAFETY: as above.
-        let skip = unsafe { std::slice::from_raw_parts(skip, width) };
-        for (z, s) in z.iter_mut().zip(skip) {
-            *z += s;
-        }
-    }
-}
-
-/// Packs `width` columns of b, filled up with zeros: `[terms][NR]`.
-#[inline(always)]
-unsafe fn pack_right<V: Simd, const NR: usize>(b: View, terms: usize, width: usize, to: *mut f32) {
-    // SAFETY: the caller's.
-    unsafe {
-        if width == NR && b.column == 1 {
-            for i in 0..terms {
-                *to.add(i * NR).cast::<[f32; NR]>() = *b.at(i, 0).cast::<[f32; NR]>();
-            }
-            return;
-        }
-        let blocks = if width == NR && b.row == 1 { terms / 8 * 8 } else { 0 };
-        for i in (0..blocks).step_by(8) {
-            for c in (0..NR).step_by(8) {
-                V::transpose(b.at(i, c), b.column, to.add(i * NR + c), NR);
-            }
-        }
-        for i in blocks..terms {
-            for c in 0..NR {
-                *to.add(i * NR + c) = if c < width { *b.at(i, c) } else { 0.0 };
-            }
-        }
-    }
-}
-
-/// Packs rows of a into micro-panels `[terms][MR]`, the last one as wide as there are rows left.
-#[inline(always)]
-unsafe fn pack_left<const MR: usize>(a: View, rows: usize, terms: usize, to: *mut f32) {
-    let (full, rest) = (rows / MR, rows % MR);
-    // SAFETY: the caller's.
-    unsafe {
-        for i in 0..terms {
-            for p in 0..full {
-                let to = to.add((p * terms + i) * MR);
-                if a.row == 1 {
-                    *to.cast::<[f32; MR]>() = *a.at(p * MR, i).cast::<[f32; MR]>();
-                } else {
-                    for r in 0..MR {
-                        *to.add(r) = *a.at(p * MR + r, i);
-                    }
-                }
-            }
-            for r in 0..rest {
-                *to.add(full * terms * MR + i * rest + r) = *a.at(full * MR + r, i);
-            }
-        }
-    }
-}
-
-/// [`tile`] for as many rows as there are.
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-unsafe fn tiles<V: Simd, const MR: usize, const NV: usize>(
-    rows: usize,
-    terms: usize,
-    a: *const f32,
-    a_row: usize,
-    a_column: usize,
-    b: *const f32,
-    b_row: usize,
-    out: *mut f32,
-    out_row: usize,
-    add: bool,
-) {
-    macro_rules! rows {
-        ($($r:literal)*) => {
-            match rows {
-                // The strides are constants where it matters.
-                r if r == MR && a_row == 1 => tile::<V, MR, NV>(terms, a, 1, MR, b, b_row, out, out_row, add),
-                r if r == MR => tile::<V, MR, NV>(terms, a, a_row, 1, b, b_row, out, out_row, add),
-                $($r if $r < MR => tile::<V, $r, NV>(terms, a, a_row, a_column, b, b_row, out, out_row, add),)*
-                _ => unreachable!("a micro-panel has at most MR rows"),
-            }
-        };
-    }
-    // SAFETY: the caller's.
-    unsafe { rows!(1 2 3 4 5 6 7 8 9 10 11) }
-}
-
-/// The micro-kernel: MR × NV vectors of sums in registers.
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-unsafe fn tile<V: Simd, const MR: usize, const NV: usize>(
-    terms: usize,
-    mut a: *const f32,
-    a_row: usize,
-    a_column: usize,
-    mut b: *const f32,
-    b_row: usize,
-    out: *mut f32,
-    out_row: usize,
-    add: bool,
-) {
-    // SAFETY: the caller's.
-    unsafe {
-        let mut sums = [[V::splat(0.0); NV]; MR];
-        if add {
-            for (r, sums) in sums.iter_mut().enumerate() {
-                for (j, sum) in sums.iter_mut().enumerate() {
-                    *sum = V::load(out.add(r * out_row + j * V::LANES));
-                }
-            }
-        }
-        for _ in 0..terms {
-            let mut right = [V::splat(0.0); NV];
-            for (j, right) in right.iter_mut().enumerate() {
-                *right = V::load(b.add(j * V::LANES));
-            }
-            for (r, sums) in sums.iter_mut().enumerate() {
-                let left = V::splat(*a.add(r * a_row));
-                for (sum, right) in sums.iter_mut().zip(&right) {
-                    *sum = sum.fma(left, *right);
-                }
-            }
-            a = a.add(a_column);
-            b = b.add(b_row);
-        }
-        for (r, sums) in sums.iter().enumerate() {
-            for (j, sum) in sums.iter().enumerate() {
-                sum.store(out.add(r * out_row + j * V::LANES));
-            }
-        }
-    }
-}
 
 #[cfg(test)]
 mod tests;

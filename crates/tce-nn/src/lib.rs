@@ -12,6 +12,7 @@ mod gemm;
 mod kernels;
 mod layers;
 mod params;
+mod probe;
 mod simd;
 mod stack;
 mod tensors;
@@ -22,6 +23,7 @@ pub use adam::{Adam, AdamConfig};
 pub use dense::{dense, dense_composed};
 pub use layers::{Dense, LayerNorm, Mlp, MlpConfig};
 pub use params::{NamedParameters, NetworkError, moving_average, parameter_count};
+pub use probe::{instructions, product_rate};
 pub use stack::ResidualStack;
 pub use tensors::{Batch, cosine_decay, host, tensor};
 

@@ -14,6 +14,12 @@ pub(crate) trait Simd: Copy {
     unsafe fn load(from: *const f32) -> Self;
     /// To memory, unaligned.
     unsafe fn store(self, to: *mut f32);
+    /// self + other
+    unsafe fn add(self, other: Self) -> Self;
+    /// max(self, 0)
+    unsafe fn positive(self) -> Self;
+    /// A wish to have this line in the first-level cache; the address need not be good.
+    unsafe fn prefetch(line: *const f32);
     /// self + a b, rounded once where the machine can.
     unsafe fn fma(self, a: Self, b: Self) -> Self;
     /// to[c][r] ← from[r][c] for an 8 × 8 block; strides in numbers.
@@ -55,6 +61,19 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i] + other.0[i]))
+    }
+
+    #[inline(always)]
+    unsafe fn positive(self) -> Self {
+        Self(self.0.map(|x| x.max(0.0)))
+    }
+
+    #[inline(always)]
+    unsafe fn prefetch(_: *const f32) {}
+
+    #[inline(always)]
     unsafe fn transpose(from: *const f32, stride: usize, to: *mut f32, to_stride: usize) {
         for r in 0..8 {
             for c in 0..8 {
@@ -72,7 +91,7 @@ mod x86 {
     use super::Simd;
 
     macro_rules! vector {
-        ($vector:ty, $lanes:literal, $splat:ident, $load:ident, $store:ident, $fma:ident) => {
+        ($vector:ty, $lanes:literal, $splat:ident, $load:ident, $store:ident, $fma:ident, $add:ident, $max:ident) => {
             // SAFETY of every block: the caller's.
             impl Simd for $vector {
                 const LANES: usize = $lanes;
@@ -98,6 +117,21 @@ mod x86 {
                 }
 
                 #[inline(always)]
+                unsafe fn add(self, other: Self) -> Self {
+                    unsafe { $add(self, other) }
+                }
+
+                #[inline(always)]
+                unsafe fn positive(self) -> Self {
+                    unsafe { $max(self, $splat(0.0)) }
+                }
+
+                #[inline(always)]
+                unsafe fn prefetch(line: *const f32) {
+                    unsafe { _mm_prefetch::<_MM_HINT_T0>(line.cast()) }
+                }
+
+                #[inline(always)]
                 unsafe fn transpose(from: *const f32, stride: usize, to: *mut f32, to_stride: usize) {
                     unsafe { transpose(from, stride, to, to_stride) }
                 }
@@ -105,8 +139,26 @@ mod x86 {
         };
     }
 
-    vector!(__m256, 8, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps);
-    vector!(__m512, 16, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps);
+    vector!(
+        __m256,
+        8,
+        _mm256_set1_ps,
+        _mm256_loadu_ps,
+        _mm256_storeu_ps,
+        _mm256_fmadd_ps,
+        _mm256_add_ps,
+        _mm256_max_ps
+    );
+    vector!(
+        __m512,
+        16,
+        _mm512_set1_ps,
+        _mm512_loadu_ps,
+        _mm512_storeu_ps,
+        _mm512_fmadd_ps,
+        _mm512_add_ps,
+        _mm512_max_ps
+    );
 
     /// Pairs, then pairs of pairs, then halves.
     #[inline(always)]

@@ -1,6 +1,7 @@
 //! The `tce` program as a library: tasks, presets and variants, the pipeline's stages, run directories and commands.
 
 mod actors;
+mod bench;
 mod commands;
 mod config;
 mod diagnostics;

@@ -8,6 +8,7 @@ use crate::error::{Error, Result};
 use crate::output::Output;
 
 mod augment;
+mod bench;
 mod collect;
 mod config;
 mod data;
@@ -52,6 +53,8 @@ enum Command {
     /// Measure what a stage of the pipeline does.
     #[command(subcommand)]
     Diagnose(diagnose::Diagnose),
+    /// Measure how fast the program's hot loops run on this machine.
+    Bench(bench::Bench),
 }
 
 impl Cli {
@@ -74,6 +77,7 @@ impl Cli {
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),
             Command::Diagnose(command) => command.run(output),
+            Command::Bench(args) => args.run(output),
         }
     }
 }
