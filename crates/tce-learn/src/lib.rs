@@ -15,6 +15,7 @@ pub mod actor;
 pub mod bc;
 mod blocks;
 mod buffer;
+pub mod critic;
 pub mod cvae;
 mod error;
 pub mod import;

@@ -76,22 +76,13 @@ pub fn kl_to_standard_normal(mean: Tensor<3>, log_std: Tensor<3>) -> Tensor<3> {
     member_mean((log_std * 2.0 + 1.0 - mean.square() - variance) * -0.5)
 }
 
-/// The smaller of two neighbouring critics: `[2P, B, 1]` → `[P, B, 1]`.
-pub fn twin_min(q: Tensor<3>) -> Tensor<3> {
-    let [twins, rows, _] = q.dims();
-    q.reshape([twins / 2, 2, rows]).min_dim(1).reshape([twins / 2, rows, 1])
-}
-
-/// Squared temporal-difference errors of twin critics, summed over the twins: q `[2P, B, 1]`, y and weights `[P, B, 1]`.
-pub fn twin_squared_error(q: Tensor<3>, y: Tensor<3>, weights: Option<Tensor<3>>) -> Tensor<3> {
-    let [twins, rows, _] = q.dims();
-    let across = |x: Tensor<3>| x.reshape([twins / 2, 1, rows]);
-    let error = (q.reshape([twins / 2, 2, rows]) - across(y)).square();
-    let error = match weights {
-        Some(w) => error * across(w),
+/// Squared temporal-difference error, mean over rows: q, y and weights `[P, B, 1]`.
+pub fn squared_td_error(q: Tensor<3>, y: Tensor<3>, weights: Option<Tensor<3>>) -> Tensor<3> {
+    let error = (q - y).square();
+    member_mean(match weights {
+        Some(w) => error * w,
         None => error,
-    };
-    error.mean_dim(2).sum_dim(1)
+    })
 }
 
 #[cfg(test)]
@@ -155,14 +146,12 @@ mod tests {
     }
 
     #[test]
-    fn twins_are_neighbours() {
-        // Member 0: critics (1, 2) and (3, 0); member 1: (5, 5) and (4, 6).
-        let q = tensor(vec![1.0, 2.0, 3.0, 0.0, 5.0, 5.0, 4.0, 6.0], [4, 2, 1], &cpu());
-        close(twin_min(q.clone()), &[1.0, 0.0, 4.0, 5.0]);
+    fn temporal_difference_errors_may_be_weighted() {
+        // Member 0: errors 0 and 1; member 1: 0 and 1, and -1 and 2.
+        let q = tensor(vec![1.0, 2.0, 4.0, 6.0], [2, 2, 1], &cpu());
         let y = tensor(vec![1.0, 1.0, 5.0, 4.0], [2, 2, 1], &cpu());
-        // Member 0: (0 + 1)/2 + (4 + 1)/2; member 1: (0 + 1)/2 + (1 + 4)/2.
-        close(twin_squared_error(q.clone(), y.clone(), None), &[3.0, 3.0]);
+        close(squared_td_error(q.clone(), y.clone(), None), &[0.5, 2.5]);
         let w = tensor(vec![1.0, 0.0, 1.0, 2.0], [2, 2, 1], &cpu());
-        close(twin_squared_error(q, y, Some(w)), &[2.0, 5.5]);
+        close(squared_td_error(q, y, Some(w)), &[0.0, 4.5]);
     }
 }

@@ -12,10 +12,7 @@ use crate::gemm::{Finish, Matrix, Right, Uninit, product};
 
 /// Rows of a task where a layer is spread over threads.
 const BLOCK: usize = 128;
-/// From this many multiply-adds a member on, the members of a layer are computed side by side: twin critics share nothing
-/// but their input.
-const MEMBER_FROM: usize = 1 << 20;
-/// Below this many multiply-adds a network's layer stays on its thread. High, because two cores that take turns at one training
+/// Below this many multiply-adds a layer stays on its thread. High, because two cores that take turns at one training
 /// step fetch each other's activations and gradients from the other's cache: measured on three 256-256 networks of 256
 /// rows, two threads made 740 updates/s and one thread 950. Trainings side by side scale; one training does not.
 const PARALLEL_FROM: usize = 1 << 28;
@@ -59,8 +56,7 @@ impl Shape {
     }
 
     fn parallel(&self) -> bool {
-        let wide = self.p > 1 && self.rows * self.i * self.o >= MEMBER_FROM;
-        (wide || self.large()) && rayon::current_num_threads() > 1
+        self.large() && rayon::current_num_threads() > 1
     }
 
     /// Rows of a task when `rows` could be one: packing the other operand again for every block costs a few percent.

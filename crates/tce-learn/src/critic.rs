@@ -1,0 +1,94 @@
+//! Twin critics with target networks (Fujimoto et al. 2018), as every algorithm here has them.
+//!
+//! | symbol | here |
+//! |---|---|
+//! | Q₁, Q₂ | [`Twins::pair`], 256-256 ReLU on [s, a] |
+//! | Q' | [`Critic::target`]: Q' ← (1 - ρ) Q' + ρ Q |
+//! | L_Q | Σᵢ mean w (Qᵢ(s, a) - y)² ([`squared_td_error`]) |
+//!
+//! The two share nothing but their input, so that they are two networks, computed side by side where there are two
+//! threads, and not one of twice the population.
+
+use std::path::Path;
+
+use tce_base::Streams;
+use tce_nn::{Averaged, Device, Mlp, MlpConfig, NamedParameters, NetworkError, Tensor, Trained};
+
+use crate::losses::squared_td_error;
+
+/// A critic and the network that follows it.
+pub struct Critic {
+    name: &'static str,
+    online: Trained<Mlp>,
+    target: Averaged<Mlp>,
+}
+
+impl Critic {
+    fn new(name: &'static str, config: &MlpConfig, members: &[Streams], device: &Device) -> Self {
+        let net = config.init(members, name, device);
+        Self { name, target: Averaged::new(&net), online: Trained::new(net) }
+    }
+
+    /// Q(s, a), `[P, B, 1]`.
+    pub fn online(&self, sa: Tensor<3>) -> Tensor<3> {
+        self.online.net().forward(sa)
+    }
+
+    /// Q'(s, a), `[P, B, 1]`, no part of autodiff.
+    pub fn target(&self, sa: Tensor<3>) -> Tensor<3> {
+        self.target.net().forward(sa)
+    }
+
+    /// A step down mean w (Q(s, a) - y)², then one of Q' after Q. Returns the loss per member, `[P, 1, 1]`.
+    fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
+        let loss = squared_td_error(self.online(sa), y, w);
+        let value = loss.clone().inner();
+        self.online.step(loss.sum(), lr);
+        self.target.follow(self.online.net(), polyak);
+        value
+    }
+}
+
+/// Two critics that differ in their initial weights.
+pub struct Twins {
+    /// Q₁ and Q₂.
+    pub pair: [Critic; 2],
+}
+
+impl Twins {
+    /// New critics on `inputs` observations and `actions`, drawn from the members' streams `critic 1` and `critic 2`.
+    /// `device` is one with autodiff.
+    pub fn new(inputs: usize, actions: usize, hidden: &[usize], members: &[Streams], device: &Device) -> Self {
+        let config = MlpConfig::relu(inputs + actions, hidden, 1);
+        Self { pair: ["critic 1", "critic 2"].map(|name| Critic::new(name, &config, members, device)) }
+    }
+
+    /// A step of both towards y. `w` `[P, B, 1]` multiplies the rows. Returns the sum of the two losses per member.
+    pub fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
+        let [one, two] = &mut self.pair;
+        let (other_sa, other_y, other_w) = (sa.clone(), y.clone(), w.clone());
+        let (a, b) =
+            rayon::join(|| one.step(sa, y, w, lr, polyak), || two.step(other_sa, other_y, other_w, lr, polyak));
+        a + b
+    }
+
+    /// Adds parameters and optimisers to `state`.
+    pub fn save(&self, state: &mut NamedParameters) {
+        for critic in &self.pair {
+            critic.online.save(critic.name, state);
+            state.collect(&format!("target {}", critic.name), critic.target.net());
+        }
+    }
+
+    /// Takes parameters and optimisers from `state`; `path` is where it came from, for messages.
+    ///
+    /// # Errors
+    /// If they belong to other critics.
+    pub fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        for critic in &mut self.pair {
+            critic.online.load(critic.name, state, path)?;
+            critic.target.load(&format!("target {}", critic.name), state, path)?;
+        }
+        Ok(())
+    }
+}
