@@ -18,8 +18,8 @@ pub(super) unsafe fn drive<V: Simd, const MR: usize, const NV: usize, const NR: 
     let rows = m.div_ceil(m.div_ceil(ROWS)).div_ceil(MR) * MR;
     let panels = n.div_ceil(NR);
     let fused = Fused::new(finish);
-    // Few rows of a read b once or twice: packing it would cost more than it saves.
-    let direct = packed.is_null() && !pack_only && b.column == 1 && m <= MR;
+    // Few rows of a read b two or three times: packing it would cost more than it saves.
+    let direct = packed.is_null() && !pack_only && b.column == 1 && m <= 3 * MR;
     // SAFETY: the caller's; every index stays below m, n and k.
     unsafe {
         for k0 in (0..k).step_by(terms) {
@@ -259,12 +259,18 @@ unsafe fn tiles<V: Simd, const MR: usize, const NV: usize>(
     add: bool,
     then: Fused,
 ) {
+    let panel = NV * V::LANES;
     macro_rules! rows {
         ($($r:literal)*) => {
             match rows {
                 // The strides are constants where it matters.
-                r if r == MR && a_row == 1 => tile::<V, MR, NV>(terms, a, 1, MR, b, b_row, out, out_row, add, then),
-                r if r == MR => tile::<V, MR, NV>(terms, a, a_row, 1, b, b_row, out, out_row, add, then),
+                r if r == MR && b_row == panel && a_row == 1 => {
+                    tile::<V, MR, NV>(terms, a, 1, MR, b, panel, out, out_row, add, then)
+                }
+                r if r == MR && b_row == panel => {
+                    tile::<V, MR, NV>(terms, a, a_row, 1, b, panel, out, out_row, add, then)
+                }
+                r if r == MR => tile::<V, MR, NV>(terms, a, a_row, a_column, b, b_row, out, out_row, add, then),
                 $($r if $r < MR => tile::<V, $r, NV>(terms, a, a_row, a_column, b, b_row, out, out_row, add, then),)*
                 _ => unreachable!("a micro-panel has at most MR rows"),
             }
@@ -274,12 +280,23 @@ unsafe fn tiles<V: Simd, const MR: usize, const NV: usize>(
     unsafe { rows!(1 2 3 4 5 6 7 8 9 10 11) }
 }
 
+/// The same pointer, in a register of its own.
+#[inline(always)]
+fn opaque(mut pointer: *const f32) -> *const f32 {
+    #[cfg(not(miri))]
+    // SAFETY: no instruction at all.
+    unsafe {
+        std::arch::asm!("/* {0} */", inout(reg) pointer, options(pure, nomem, nostack, preserves_flags))
+    };
+    pointer
+}
+
 /// The micro-kernel: MR × NV vectors of sums in registers.
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 unsafe fn tile<V: Simd, const MR: usize, const NV: usize>(
     terms: usize,
-    mut a: *const f32,
+    a: *const f32,
     a_row: usize,
     a_column: usize,
     mut b: *const f32,
@@ -299,19 +316,40 @@ unsafe fn tile<V: Simd, const MR: usize, const NV: usize>(
                 }
             }
         }
-        for _ in 0..terms {
-            let mut right = [V::splat(0.0); NV];
-            for (j, right) in right.iter_mut().enumerate() {
-                *right = V::load(b.add(j * V::LANES));
+        // A pointer for three rows each: the rest of an address fits the instruction. Left alone, the compiler adds the stride
+        // again and again, one instruction per row and term.
+        let mut lefts = [a; 4];
+        for (g, left) in lefts.iter_mut().enumerate().take(MR.div_ceil(3)) {
+            *left = a.add(3 * g * a_row);
+            if a_row != 1 {
+                *left = opaque(*left);
             }
-            for (r, sums) in sums.iter_mut().enumerate() {
-                let left = V::splat(*a.add(r * a_row));
-                for (sum, right) in sums.iter_mut().zip(&right) {
-                    *sum = sum.fma(left, *right);
+        }
+        macro_rules! step {
+            ($count:literal) => {
+                for u in 0..$count {
+                    let mut right = [V::splat(0.0); NV];
+                    for (j, right) in right.iter_mut().enumerate() {
+                        *right = V::load(b.add(u * b_row + j * V::LANES));
+                    }
+                    for (r, sums) in sums.iter_mut().enumerate() {
+                        let left = V::splat(*lefts[r / 3].add(r % 3 * a_row + u * a_column));
+                        for (sum, right) in sums.iter_mut().zip(&right) {
+                            *sum = sum.fma(left, *right);
+                        }
+                    }
                 }
-            }
-            a = a.add(a_column);
-            b = b.add(b_row);
+                for left in &mut lefts {
+                    *left = left.add($count * a_column);
+                }
+                b = b.add($count * b_row);
+            };
+        }
+        for _ in 0..terms / 4 {
+            step!(4);
+        }
+        for _ in 0..terms % 4 {
+            step!(1);
         }
         if !then.bias.is_null() {
             for j in 0..NV {
