@@ -193,11 +193,13 @@ impl Trainer {
             Schedule::Constant => self.config.learning_rate,
             Schedule::Cosine => cosine_decay(self.config.learning_rate, self.step, steps),
         };
-        self.network.step(loss.sum(), rate);
-        if let Some(average) = &mut self.average {
-            let t = self.step as f64;
-            let keep = self.config.ema.min((1.0 + t) / (10.0 + t));
-            average.follow(self.network.net(), 1.0 - keep);
+        match &mut self.average {
+            None => self.network.step(loss.sum(), rate),
+            Some(average) => {
+                let t = self.step as f64;
+                let keep = self.config.ema.min((1.0 + t) / (10.0 + t));
+                self.network.step_averaged(loss.sum(), rate, average, 1.0 - keep);
+            }
         }
         self.step += 1;
         detached

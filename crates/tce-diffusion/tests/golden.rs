@@ -165,8 +165,10 @@ fn two_modes_get_their_shares_and_widths() {
     let paper = [ve(Start::Normal), vp(), edm()].map(|p| (p, Sampler::paper()));
     let euler = [ve(Start::Data), vp(), edm()].map(|p| (p, EULER));
     // The start of VE as written misses the variance, which without a corrector nothing mends.
-    let fine = [ve(Start::Data), vp(), edm()]
-        .map(|p| [(p, Sampler::Heun { steps: 60 }), (p, Sampler::DpmSolver { steps: 60 })]);
+    let fine = [ve(Start::Data), vp(), edm()].map(|p| {
+        [Sampler::Heun { steps: 60 }, Sampler::DpmSolver { steps: 60 }, Sampler::SdeDpmSolver { steps: 100 }]
+            .map(|s| (p, s))
+    });
     for (process, sampler) in paper.into_iter().chain(euler).chain(fine.into_iter().flatten()) {
         let (share, left, right) = mixture(&process, sampler);
         let context = format!("{process:?} {sampler:?}: {share:.3} {left:.3?} {right:.3?}");

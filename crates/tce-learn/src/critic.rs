@@ -43,8 +43,7 @@ impl Critic {
     fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
         let loss = squared_td_error(self.online(sa), y, w);
         let value = loss.clone().inner();
-        self.online.step(loss.sum(), lr);
-        self.target.follow(self.online.net(), polyak);
+        self.online.step_averaged(loss.sum(), lr, &mut self.target, polyak);
         value
     }
 }

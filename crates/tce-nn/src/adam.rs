@@ -1,12 +1,17 @@
-//! Adam (Kingma & Ba 2015), one pass over memory per parameter on the CPU.
+//! Adam (Kingma & Ba 2015), one pass over memory per parameter on the CPU, together with the moving average of the parameters
+//! where there is one.
 //!
-//! m ← β₁ m + (1 − β₁) g,  v ← β₂ v + (1 − β₂) g²,  θ ← θ − lr · m̂ / (√v̂ + ε), with m̂ = m / (1 − β₁ᵗ) and v̂ likewise.
+//! m ← β₁ m + (1 − β₁) g,  v ← β₂ v + (1 − β₂) g²,  θ ← θ − lr · m̂ / (√v̂ + ε), with m̂ = m / (1 − β₁ᵗ) and v̂ likewise;
+//! θ' ← θ' + ρ (θ − θ').
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
 //! | β₁, β₂ | `beta_1`, `beta_2` | 0.9, 0.999 | PyTorch's defaults, as in every code of the field |
 //! | ε | `epsilon` | 1e-8 | the same |
 //! | λ | `weight_decay` | 0 | decoupled (AdamW), multiplied by lr |
+//! | ρ | argument of [`Adam::step_averaged`] | – | the learner's |
+
+use std::collections::VecDeque;
 
 use burn::backend::Flex;
 use burn::module::{Module, ModuleMapper, Param};
@@ -15,6 +20,7 @@ use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
 use crate::dense::is_flex;
+use crate::params::follow;
 
 /// The constants of [`Adam`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -54,6 +60,33 @@ pub struct Adam {
 impl Adam {
     /// One step along `grads`. Parameters without a gradient stay as they are.
     pub fn step<M: Module>(&mut self, lr: f64, module: M, grads: &mut Gradients) -> M {
+        self.advance(lr, module, grads, None)
+    }
+
+    /// [`Adam::step`], then `average` a step of `rate` towards the result; parameters without a gradient included.
+    /// `average` is outside of autodiff.
+    pub fn step_averaged<M: Module>(
+        &mut self,
+        lr: f64,
+        module: M,
+        grads: &mut Gradients,
+        average: M,
+        rate: f64,
+    ) -> (M, M) {
+        let mut followers = Followers { rate: rate as f32, tensors: Default::default() };
+        // Taken out of the module, the tensors have one owner and are changed in place.
+        let average = average.map(&mut Taker { out: &mut followers.tensors });
+        let module = self.advance(lr, module, grads, Some(&mut followers));
+        (module, average.map(&mut Giver { from: &mut followers.tensors }))
+    }
+
+    fn advance<M: Module>(
+        &mut self,
+        lr: f64,
+        module: M,
+        grads: &mut Gradients,
+        followers: Option<&mut Followers>,
+    ) -> M {
         self.time += 1;
         let c = self.config;
         let coefficients = Coefficients {
@@ -64,7 +97,7 @@ impl Adam {
             epsilon: (c.epsilon * (1.0 - c.beta_2.powi(self.time)).sqrt()) as f32,
             keep: (1.0 - lr * c.weight_decay) as f32,
         };
-        module.map(&mut Stepper { index: 0, moments: &mut self.moments, grads, coefficients })
+        module.map(&mut Stepper { index: 0, moments: &mut self.moments, grads, coefficients, followers })
     }
 
     /// Steps taken, and (m, v) of each parameter in module order; what a checkpoint holds.
@@ -87,7 +120,40 @@ struct Coefficients {
     keep: f32,
 }
 
+/// The parameters of a moving average, in module order; each goes to the end of the queue when it has moved.
+struct Followers {
+    rate: f32,
+    tensors: VecDeque<Tensor<1>>,
+}
+
+struct Taker<'a> {
+    out: &'a mut VecDeque<Tensor<1>>,
+}
+
+impl ModuleMapper for Taker<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (id, tensor, mapper) = param.consume();
+        // A view that keeps the shape and none of the memory.
+        let place = Tensor::<D>::zeros([1; D], &tensor.device()).expand(tensor.shape());
+        self.out.push_back(tensor.reshape([-1]));
+        Param::from_mapped_value(id, place, mapper)
+    }
+}
+
+struct Giver<'a> {
+    from: &'a mut VecDeque<Tensor<1>>,
+}
+
+impl ModuleMapper for Giver<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (id, place, mapper) = param.consume();
+        let tensor = self.from.pop_front().expect("one per parameter");
+        Param::from_mapped_value(id, tensor.reshape(place.shape()), mapper)
+    }
+}
+
 struct Stepper<'a> {
+    followers: Option<&'a mut Followers>,
     index: usize,
     moments: &'a mut Vec<(Tensor<1>, Tensor<1>)>,
     grads: &'a mut Gradients,
@@ -106,60 +172,100 @@ impl ModuleMapper for Stepper<'_> {
             let zeros = || Tensor::zeros([shape.num_elements()], &flat.device());
             self.moments.push((zeros(), zeros()));
         }
+        let mut follower =
+            self.followers.as_mut().map(|f| (f.tensors.pop_front().expect("networks of one kind"), f.rate));
         let flat = match grad {
-            None => flat,
+            None => {
+                follower = follower.map(|(average, rate)| (follow(average, flat.clone(), rate), rate));
+                flat
+            }
             Some(grad) => {
                 let slot = &mut self.moments[index];
                 let empty = || Tensor::empty([0], &flat.device());
                 let (m, v) = std::mem::replace(slot, (empty(), empty()));
-                let (flat, m, v) = update(flat, grad.reshape([-1]), m, v, self.coefficients);
-                *slot = (m, v);
-                flat
+                let state = State { theta: flat, m, v, follower };
+                let state = update(state, grad.reshape([-1]), self.coefficients);
+                *slot = (state.m, state.v);
+                follower = state.follower;
+                state.theta
             }
         };
+        if let (Some(followers), Some((average, _))) = (self.followers.as_mut(), follower) {
+            followers.tensors.push_back(average);
+        }
         let tensor = Tensor::from_inner(flat.reshape(shape)).require_grad();
         Param::from_mapped_value(id, tensor, mapper)
     }
 }
 
-fn update(
+/// What a step changes of one parameter: θ, m, v, and θ' with ρ.
+struct State {
     theta: Tensor<1>,
-    g: Tensor<1>,
     m: Tensor<1>,
     v: Tensor<1>,
-    c: Coefficients,
-) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
-    if !is_flex(&theta) {
-        return update_composed(theta, g, m, v, c);
-    }
-    let primitive = |t: Tensor<1>| t.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff");
-    let (mut theta, g, mut m, mut v) = (primitive(theta), primitive(g), primitive(m), primitive(v));
-    let g = g.to_contiguous();
-    fused(theta.storage_mut(), g.as_slice().expect("contiguous"), m.storage_mut(), v.storage_mut(), c);
-    let tensor = Tensor::from_primitive::<Flex>;
-    (tensor(theta), tensor(m), tensor(v))
+    follower: Option<(Tensor<1>, f32)>,
 }
 
-fn update_composed(
-    theta: Tensor<1>,
-    g: Tensor<1>,
-    m: Tensor<1>,
-    v: Tensor<1>,
-    c: Coefficients,
-) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
-    let m = m * c.beta_1 + g.clone() * (1.0 - c.beta_1);
-    let v = v * c.beta_2 + g.square() * (1.0 - c.beta_2);
-    let theta = theta * c.keep - m.clone() * c.step / (v.clone().sqrt() + c.epsilon);
-    (theta, m, v)
+fn update(state: State, g: Tensor<1>, c: Coefficients) -> State {
+    if !is_flex(&state.theta) {
+        return update_composed(state, g, c);
+    }
+    let primitive = |t: Tensor<1>| t.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff");
+    let (mut theta, mut m, mut v) = (primitive(state.theta), primitive(state.m), primitive(state.v));
+    let g = primitive(g).to_contiguous();
+    let g = g.as_slice().expect("contiguous");
+    let follower = match state.follower {
+        None => {
+            fused(theta.storage_mut(), g, m.storage_mut(), v.storage_mut(), c);
+            None
+        }
+        Some((average, rate)) => {
+            let mut average = primitive(average);
+            let (theta, m, v) = (theta.storage_mut(), m.storage_mut(), v.storage_mut());
+            fused_averaged(theta, g, m, v, c, average.storage_mut(), rate);
+            Some((Tensor::from_primitive::<Flex>(average), rate))
+        }
+    };
+    let tensor = Tensor::from_primitive::<Flex>;
+    State { theta: tensor(theta), m: tensor(m), v: tensor(v), follower }
+}
+
+fn update_composed(state: State, g: Tensor<1>, c: Coefficients) -> State {
+    let m = state.m * c.beta_1 + g.clone() * (1.0 - c.beta_1);
+    let v = state.v * c.beta_2 + g.square() * (1.0 - c.beta_2);
+    let theta = state.theta * c.keep - m.clone() * c.step / (v.clone().sqrt() + c.epsilon);
+    let follower = state.follower.map(|(average, rate)| (average.clone() + (theta.clone() - average) * rate, rate));
+    State { theta, m, v, follower }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn fused(theta: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], c: Coefficients) {
     for (((theta, g), m), v) in theta.iter_mut().zip(g).zip(m).zip(v) {
-        *m = *m * c.beta_1 + g * (1.0 - c.beta_1);
-        *v = *v * c.beta_2 + (g * g) * (1.0 - c.beta_2);
-        *theta = *theta * c.keep - *m * c.step / (v.sqrt() + c.epsilon);
+        step(theta, *g, m, v, c);
     }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn fused_averaged(
+    theta: &mut [f32],
+    g: &[f32],
+    m: &mut [f32],
+    v: &mut [f32],
+    c: Coefficients,
+    average: &mut [f32],
+    rate: f32,
+) {
+    for ((((theta, g), m), v), average) in theta.iter_mut().zip(g).zip(m).zip(v).zip(average) {
+        step(theta, *g, m, v, c);
+        *average += rate * (*theta - *average);
+    }
+}
+
+#[inline(always)]
+fn step(theta: &mut f32, g: f32, m: &mut f32, v: &mut f32, c: Coefficients) {
+    *m = *m * c.beta_1 + g * (1.0 - c.beta_1);
+    *v = *v * c.beta_2 + (g * g) * (1.0 - c.beta_2);
+    *theta = *theta * c.keep - *m * c.step / (v.sqrt() + c.epsilon);
 }
 
 #[cfg(test)]
@@ -193,14 +299,44 @@ mod tests {
         let vector = |scale: f32| Tensor::<1>::from_floats([0.5, -1.0, 2.0, 1e-3].map(|v: f32| v * scale), &device);
         let c = Coefficients { beta_1: 0.9, beta_2: 0.999, step: 1e-2, epsilon: 1e-8, keep: 0.99 };
         let start = || (vector(1.0), vector(-0.3), vector(0.1), vector(1.0).abs());
-        let (t, g, m, v) = start();
-        let a = update(t, g, m, v, c);
-        let (t, g, m, v) = start();
-        let b = update_composed(t, g, m, v, c);
-        for (a, b) in [(a.0, b.0), (a.1, b.1), (a.2, b.2)] {
-            for (a, b) in host(a).into_iter().zip(host(b)) {
-                assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0));
+        for average in [false, true] {
+            let state = |(theta, _, m, v): (_, Tensor<1>, _, _)| State {
+                theta,
+                m,
+                v,
+                follower: average.then(|| (vector(3.0), 0.25)),
+            };
+            let (a, b) = (update(state(start()), start().1, c), update_composed(state(start()), start().1, c));
+            let follower = |s: &State| s.follower.as_ref().map_or_else(|| vector(0.0), |f| f.0.clone());
+            for (a, b) in [(follower(&a), follower(&b)), (a.theta, b.theta), (a.m, b.m), (a.v, b.v)] {
+                for (a, b) in host(a).into_iter().zip(host(b)) {
+                    assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0));
+                }
             }
         }
+    }
+
+    /// The same bytes as a step and then an average, for parameters with and without a gradient.
+    #[test]
+    fn a_step_with_an_average_is_both() {
+        let device = Device::flex().autodiff();
+        let streams = [Streams::new(1)];
+        let layer = || Dense::new(&streams, "x", 5, 3, Activation::Identity, &device);
+        // The bias takes no part in the loss.
+        let loss = |l: &Dense| l.weight.val().square().sum();
+        let start = || crate::moving_average(layer().valid(), &layer(), 0.0);
+        let (mut both, mut average, mut one) = (layer(), start(), AdamConfig::default().init());
+        let (mut alone, mut after, mut two) = (layer(), start(), AdamConfig::default().init());
+        for _ in 0..3 {
+            let mut grads = loss(&both).backward();
+            (both, average) = one.step_averaged(1e-2, both, &mut grads, average, 0.1);
+            let mut grads = loss(&alone).backward();
+            alone = two.step(1e-2, alone, &mut grads);
+            after = crate::moving_average(after, &alone, 0.1);
+        }
+        let values = |l: &Dense| [host(l.weight.val()), host(l.bias.val())];
+        assert_eq!(values(&both), values(&alone));
+        assert_eq!(values(&average), values(&after));
+        assert_eq!(average.weight.dims(), [1, 5, 3]);
     }
 }

@@ -67,7 +67,7 @@ impl<C: CheckpointStrategy> DenseBackend for Autodiff<Flex, C> {
         let (x, w, b) = (x.to_contiguous(), w.to_contiguous(), b.to_contiguous());
         match DenseGradient.prepare::<C>(guards).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let (y, kept) = forward(&x, &w, &b, act, act.derivative_needs_input());
+                let (y, kept) = forward(&x, &w, &b, act, act.keeps_slope());
                 let kept = kept.unwrap_or_else(|| y.clone());
                 prep.finish(Saved { x, w, kept, act }, y)
             }
@@ -84,7 +84,7 @@ struct DenseGradient;
 struct Saved {
     x: FlexTensor,
     w: FlexTensor,
-    /// z for SiLU, y for the other activations.
+    /// act'(z) for SiLU, y for the other activations.
     kept: FlexTensor,
     act: Activation,
 }
@@ -149,7 +149,7 @@ fn shape_of(x: &FlexTensor, w: &FlexTensor) -> Shape {
     Shape { p, px, rows, i, o }
 }
 
-/// y and, where wanted, z.
+/// y and, where wanted, act'(z).
 fn forward(
     x: &FlexTensor,
     w: &FlexTensor,

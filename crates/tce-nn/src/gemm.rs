@@ -102,7 +102,7 @@ pub(crate) enum Finish<'a> {
     Store,
     /// It is added to what is there.
     Add,
-    /// skip + act(z + bias); z + bias goes to `kept`, skip to nothing where there is none.
+    /// skip + act(z + bias), with act'(z + bias) to `kept`.
     Activate {
         /// `[n]`
         bias: &'a [f32],

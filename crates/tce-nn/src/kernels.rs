@@ -70,7 +70,7 @@ fn run<T: Send>(parallel: bool, tasks: Vec<T>, task: impl Fn(T) + Sync + Send) {
     if parallel { tasks.into_par_iter().for_each(task) } else { tasks.into_iter().for_each(task) }
 }
 
-/// Forward pass; writes all of `y`. `kept` receives the pre-activations, for activations whose derivative needs them.
+/// Forward pass; writes all of `y`. `kept` receives act'(z), for activations whose derivative is no function of y.
 pub(crate) fn forward(
     shape: Shape,
     x: &[f32],

@@ -234,16 +234,19 @@ impl ModuleMapper for Averager {
         let (id, tensor, mapper) = param.consume();
         let shape = tensor.shape();
         let (average, online) = (tensor.inner().reshape([-1]), self.values.next().expect("networks of one kind"));
-        let average: Tensor<1> = if is_flex(&average) {
-            let primitive = |t: Tensor<1>| t.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff");
-            let (mut average, online) = (primitive(average), primitive(online).to_contiguous());
-            lerp(average.storage_mut(), online.as_slice().expect("contiguous"), self.rate);
-            Tensor::from_primitive::<Flex>(average)
-        } else {
-            average.clone() + (online - average) * self.rate
-        };
-        Param::from_mapped_value(id, average.reshape(shape), mapper)
+        Param::from_mapped_value(id, follow(average, online, self.rate).reshape(shape), mapper)
     }
+}
+
+/// average + rate (online − average), in place on the CPU where the average has one owner.
+pub(crate) fn follow(average: Tensor<1>, online: Tensor<1>, rate: f32) -> Tensor<1> {
+    if !is_flex(&average) {
+        return average.clone() + (online - average) * rate;
+    }
+    let primitive = |t: Tensor<1>| t.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff");
+    let (mut average, online) = (primitive(average), primitive(online).to_contiguous());
+    lerp(average.storage_mut(), online.as_slice().expect("contiguous"), rate);
+    Tensor::from_primitive::<Flex>(average)
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]

@@ -37,6 +37,16 @@ impl<M: Module> Trained<M> {
         self.net = Some(self.adam.step(lr, net, &mut grads));
     }
 
+    /// [`Trained::step`], then `average` a step of `rate` after the result, in one pass over memory.
+    pub fn step_averaged(&mut self, loss: Tensor<1>, lr: f64, average: &mut Averaged<M>, rate: f64) {
+        let mut grads = loss.backward();
+        drop(loss);
+        let net = self.net.take().expect("only empty during a step");
+        let slow = average.net.take().expect("only empty while it moves");
+        let (net, slow) = self.adam.step_averaged(lr, net, &mut grads, slow, rate);
+        (self.net, average.net) = (Some(net), Some(slow));
+    }
+
     /// Adds parameters and moments to `state`.
     pub fn save(&self, name: &str, state: &mut NamedParameters) {
         state.collect(name, self.net());
@@ -96,12 +106,6 @@ impl<M: Module> Averaged<M> {
     /// The network.
     pub fn net(&self) -> &M {
         self.net.as_ref().expect("only empty while it moves")
-    }
-
-    /// θ' ← (1 - rate) θ' + rate θ.
-    pub fn follow(&mut self, online: &M, rate: f64) {
-        let net = self.net.take().expect("only empty while it moves");
-        self.net = Some(moving_average(net, online, rate));
     }
 
     /// Takes the parameters from `state`.

@@ -187,10 +187,13 @@ unsafe fn activate_row<const N: usize>(
         for (z, b) in row.iter_mut().zip(bias) {
             *z += b;
         }
-        if !kept.is_null() {
-            kept.write_unaligned(row);
+        if kept.is_null() {
+            act.apply(&mut row);
+        } else {
+            let mut slope = [0.0; N];
+            act.apply_with_slope(&mut row, &mut slope);
+            kept.write_unaligned(slope);
         }
-        act.apply(&mut row);
         if !skip.is_null() {
             for (z, s) in row.iter_mut().zip(skip.read_unaligned()) {
                 *z += s;

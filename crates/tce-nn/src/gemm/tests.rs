@@ -36,13 +36,17 @@ proptest! {
         let expected = |i: usize, j: usize| {
             let term = |t: usize| left.data[i * left.row + t * left.column] as f64
                 * right.data[t * right.row + j * right.column] as f64;
+            // The result and, for the last kind, the slope.
             let z = (0..k).map(term).sum::<f64>();
             let active = z + bias[j] as f64;
             match kind {
                 0 => (z, z),
                 1 => (z + before[i * n + j] as f64, z),
                 2 => (active.max(0.0), active),
-                _ => (active / (1.0 + (-active).exp()) + skip[i * n + j] as f64, active),
+                _ => {
+                    let s = 1.0 / (1.0 + (-active).exp());
+                    (active * s + skip[i * n + j] as f64, s * (1.0 + active * (1.0 - s)))
+                }
             }
         };
         let mut first: Option<(Isa, Vec<f32>)> = None;

@@ -41,8 +41,14 @@ pub struct GeneratorArgs {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Only the configured process and sampler instead of all combinations.
-    #[arg(long)]
+    /// The noise processes, separated by commas: ve, vp, edm, each with its defaults.
+    #[arg(long, value_delimiter = ',', value_parser = process, default_value = "ve,vp,edm")]
+    processes: Vec<Process>,
+    /// The samplers, separated by commas: pc:STEPS, euler:STEPS, heun:STEPS, dpm:STEPS, sde-dpm:STEPS.
+    #[arg(long, value_delimiter = ',', value_parser = sampler, default_value = "pc:500,heun:18,dpm:20")]
+    samplers: Vec<Sampler>,
+    /// Only the configured process and sampler instead.
+    #[arg(long, conflicts_with_all = ["processes", "samplers"])]
     only: bool,
     #[command(flatten)]
     config: ConfigArgs,
@@ -68,6 +74,33 @@ struct Row {
     quality: Quality,
 }
 
+fn process(name: &str) -> std::result::Result<Process, String> {
+    match name {
+        "ve" => Ok(Process::Ve(Ve::default())),
+        "vp" => Ok(Process::Vp(Vp::default())),
+        "edm" => Ok(Process::Edm(Edm::default())),
+        _ => Err("expected ve, vp or edm".into()),
+    }
+}
+
+fn sampler(text: &str) -> std::result::Result<Sampler, String> {
+    let expected = "expected pc, euler, heun, dpm or sde-dpm, a colon, and the number of steps, as in dpm:20";
+    let (kind, steps) = text.split_once(':').ok_or(expected)?;
+    let steps = steps.parse().map_err(|_| expected)?;
+    let sampler = match (kind, Sampler::paper()) {
+        ("pc", Sampler::PredictorCorrector { snr, corrections, .. }) => {
+            Sampler::PredictorCorrector { steps, snr, corrections }
+        }
+        ("euler", _) => Sampler::EulerMaruyama { steps },
+        ("heun", _) => Sampler::Heun { steps },
+        ("dpm", _) => Sampler::DpmSolver { steps },
+        ("sde-dpm", _) => Sampler::SdeDpmSolver { steps },
+        _ => return Err(expected.into()),
+    };
+    sampler.check().map_err(|e| e.to_string())?;
+    Ok(sampler)
+}
+
 fn process_name(process: &Process) -> &'static str {
     match process {
         Process::Ve(_) => "VE as written",
@@ -82,6 +115,7 @@ fn sampler_name(sampler: &Sampler) -> String {
         Sampler::EulerMaruyama { steps } => format!("Euler-Maruyama-{steps}"),
         Sampler::Heun { steps, .. } => format!("Heun-{steps}"),
         Sampler::DpmSolver { steps, .. } => format!("DPM++(2M)-{steps}"),
+        Sampler::SdeDpmSolver { steps, .. } => format!("SDE-DPM++(2M)-{steps}"),
     }
 }
 
@@ -108,11 +142,11 @@ impl GeneratorArgs {
 
         let processes = match self.only {
             true => vec![config.generator.process],
-            false => vec![Process::Ve(Ve::default()), Process::Vp(Vp::default()), Process::Edm(Edm::default())],
+            false => self.processes,
         };
         let samplers = match self.only {
             true => vec![config.generator.sampler],
-            false => vec![Sampler::paper(), Sampler::Heun { steps: 18 }, Sampler::DpmSolver { steps: 20 }],
+            false => self.samplers,
         };
         let mut rows = Vec::new();
         let mut floors = None;
@@ -200,4 +234,18 @@ fn render(r: &Report) -> String {
         r.real.p90,
         table(&header, lines)
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samplers_are_named_by_kind_and_steps() {
+        assert_eq!(sampler("pc:500"), Ok(Sampler::paper()));
+        assert_eq!(sampler("sde-dpm:12"), Ok(Sampler::SdeDpmSolver { steps: 12 }));
+        for wrong in ["dpm", "dpm:x", "ode:3", "heun:1"] {
+            assert!(sampler(wrong).is_err(), "{wrong}");
+        }
+    }
 }
