@@ -6,7 +6,7 @@
 //! | W, b | `[P, I, O]`, `[P, 1, O]` | P independent layers |
 //! | y | `[P, B, O]` | output |
 //!
-//! Twin critics are neighbours: P = 2 Px, so that members 2p and 2p + 1 read the same input without a copy of it.
+//! With P = k Px, k neighbouring members read the same input without a copy of it (an ensemble per seed).
 
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;

@@ -122,6 +122,9 @@ pub(crate) enum Isa {
     #[cfg(target_arch = "x86_64")]
     Avx2,
     Portable,
+    /// AVX-512's shapes on portable vectors: the tests of a machine without it.
+    #[cfg(test)]
+    Wide,
 }
 
 impl Isa {
@@ -138,6 +141,8 @@ impl Isa {
             }
         }
         out.push(Self::Portable);
+        #[cfg(test)]
+        out.push(Self::Wide);
         out
     }
 
@@ -152,6 +157,8 @@ impl Isa {
         let lanes = match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => 16,
+            #[cfg(test)]
+            Self::Wide => 16,
             _ => 8,
         };
         if n <= lanes { lanes } else { 2 * lanes }
@@ -235,6 +242,8 @@ fn product_on(isa: Isa, out: &mut Uninit, a: Matrix, b: Right, [m, k, n]: [usize
             } else {
                 match (isa, packed.is_null() && a.column == 1 && n <= DOTS) {
                     (Isa::Portable, true) => dots_portable(&job, &finish, scratch.b),
+                    #[cfg(test)]
+                    (Isa::Wide, true) => dots_wide(&job, &finish, scratch.b),
                     #[cfg(target_arch = "x86_64")]
                     (Isa::Avx2, true) => dots_avx2(&job, &finish, scratch.b),
                     #[cfg(target_arch = "x86_64")]
@@ -277,8 +286,12 @@ unsafe fn run(isa: Isa, job: &Job, finish: &Finish, scratch: Scratch, pack_only:
             (Isa::Avx2, 8) => avx2_narrow(job, finish, scratch, pack_only),
             #[cfg(target_arch = "x86_64")]
             (Isa::Avx2, _) => avx2(job, finish, scratch, pack_only),
-            (Isa::Portable, 8) => drive::<Portable, 4, 1, 8>(job, finish, scratch, pack_only),
-            (Isa::Portable, _) => drive::<Portable, 4, 2, 16>(job, finish, scratch, pack_only),
+            #[cfg(test)]
+            (Isa::Wide, 16) => drive::<Portable<16>, 12, 1, 16>(job, finish, scratch, pack_only),
+            #[cfg(test)]
+            (Isa::Wide, _) => drive::<Portable<16>, 12, 2, 32>(job, finish, scratch, pack_only),
+            (Isa::Portable, 8) => drive::<Portable<8>, 4, 1, 8>(job, finish, scratch, pack_only),
+            (Isa::Portable, _) => drive::<Portable<8>, 4, 2, 16>(job, finish, scratch, pack_only),
         }
     }
 }
@@ -314,7 +327,8 @@ macro_rules! dots {
     };
 }
 
-dots!(dots_portable, Portable, 2,);
+dots!(dots_portable, Portable<8>, 2,);
+dots!(dots_wide, Portable<16>, 1, #[cfg(test)]);
 dots!(dots_avx2, std::arch::x86_64::__m256, 2, #[cfg(target_arch = "x86_64")] #[target_feature(enable = "avx2,fma")]);
 dots!(dots_avx512, std::arch::x86_64::__m512, 1,
     #[cfg(target_arch = "x86_64")] #[target_feature(enable = "avx512f,avx2,fma")]);

@@ -1,8 +1,9 @@
 //! Networks with a population axis.
 //!
-//! Every parameter has the shape `[P, ...]` and every batch `[P, B, D]`: P independent networks (seeds, tasks, twin
-//! critics) are one set of tensors and one training. Tensors, autodiff and modules are burn's; what the CPU does more
-//! than once per step (dense layers, Adam, moving averages) goes through fused operations ([`dense`], [`Adam`]), of which
+//! Every parameter has the shape `[P, ...]` and every batch `[P, B, D]`: P independent networks (seeds, tasks,
+//! ensembles) are one set of tensors and one training. Tensors, autodiff and modules are burn's; what the CPU does more
+//! than once per step (dense layers, Adam, moving averages, a score network's trunk in sampling) goes through fused operations ([`dense`],
+//! [`Adam`], [`ResidualStack`]), of which
 //! the plain composition of burn operations is the definition and the test oracle.
 
 mod activation;

@@ -31,6 +31,6 @@ pub fn instructions() -> &'static str {
         Isa::Avx512 => "AVX-512",
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => "AVX2",
-        Isa::Portable => "portable kernels",
+        _ => "portable kernels",
     }
 }
