@@ -122,9 +122,30 @@ impl PolicyOutput {
     /// # Panics
     /// If the form is not [`PolicyForm::TanhGaussian`].
     pub fn sample(&self, members: &[Streams], step: u64) -> Tensor<3> {
+        self.draw(members, "policy noise", step).1
+    }
+
+    /// A sample ã = tanh(u), u = μ + σ n, and its log density Σ_d ln N(u_d; μ_d, σ_d²) - ln(1 - tanh² u_d), `[P, B, 1]`;
+    /// n from the members' streams `name`, index `step`.
+    ///
+    /// # Panics
+    /// If the form is not [`PolicyForm::TanhGaussian`].
+    pub fn sample_with_log_prob(&self, members: &[Streams], name: &str, step: u64) -> (Tensor<3>, Tensor<3>) {
+        let (u, action) = self.draw(members, name, step);
+        let (mean, log_std) = self.pre_tanh.clone().expect("as above");
+        // ln(1 - tanh² u) = 2 (ln 2 - |u| - ln(1 + e^(-2|u|))): no logarithm of a vanishing number.
+        let magnitude = u.clone().abs();
+        let softplus = (magnitude.clone() * -2.0).exp().log1p();
+        let squash = ((magnitude + softplus).neg() + std::f64::consts::LN_2) * 2.0;
+        (action, normal_log_prob(u, mean, log_std) - squash.sum_dim(2))
+    }
+
+    /// (u, tanh u).
+    fn draw(&self, members: &[Streams], name: &str, step: u64) -> (Tensor<3>, Tensor<3>) {
         let (mean, log_std) = self.pre_tanh.as_ref().expect("only a tanh-Gaussian policy is sampled in training");
-        let noise = member_noise(members, "policy noise", step, mean.dims(), &mean.device().inner());
-        (mean.clone() + log_std.clone().exp() * noise).tanh()
+        let noise = member_noise(members, name, step, mean.dims(), &mean.device().inner());
+        let u = mean.clone() + log_std.clone().exp() * noise;
+        (u.clone(), u.tanh())
     }
 }
 
@@ -172,7 +193,15 @@ impl Actor {
 
     /// π(·|s).
     pub fn forward(&self, s: Tensor<3>) -> PolicyOutput {
-        let net = self.net.net();
+        self.output(self.net.net(), s)
+    }
+
+    /// π(·|s) outside of autodiff.
+    pub fn frozen(&self, s: Tensor<3>) -> PolicyOutput {
+        self.output(&self.net.net().valid(), s)
+    }
+
+    fn output(&self, net: &ActorNet, s: Tensor<3>) -> PolicyOutput {
         let out = net.mlp.forward(s);
         let log_std = net.log_std.as_ref().map(|p| p.val().clamp(FREE_LOG_STD_RANGE.0, FREE_LOG_STD_RANGE.1));
         if self.config.form != PolicyForm::TanhGaussian {

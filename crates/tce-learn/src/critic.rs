@@ -12,7 +12,7 @@
 use std::path::Path;
 
 use tce_base::Streams;
-use tce_nn::{Averaged, Device, Mlp, MlpConfig, NamedParameters, NetworkError, Tensor, Trained};
+use tce_nn::{Averaged, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::losses::squared_td_error;
 
@@ -37,6 +37,11 @@ impl Critic {
     /// Q'(s, a), `[P, B, 1]`, no part of autodiff.
     pub fn target(&self, sa: Tensor<3>) -> Tensor<3> {
         self.target.net().forward(sa)
+    }
+
+    /// Q(s, a) with weights that get no gradient; the action does.
+    pub fn frozen(&self, sa: Tensor<3>) -> Tensor<3> {
+        self.online.net().valid().forward(sa)
     }
 
     /// A step down mean w (Q(s, a) - y)², then one of Q' after Q. Returns the loss per member, `[P, 1, 1]`.

@@ -25,6 +25,7 @@ pub mod losses;
 pub mod pair_model;
 mod policy;
 pub mod regulariser;
+pub mod sac;
 mod training;
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};

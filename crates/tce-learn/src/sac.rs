@@ -1,0 +1,171 @@
+//! Soft actor-critic (Haarnoja et al. 2018, 2019): how D4RL made its data, and how this project makes its own.
+//!
+//! ```text
+//! a'  ~ π(·|s');  y = r + γ (1 - terminal) (min(Q1', Q2')(s', a') - α ln π(a'|s'))
+//! L_Q = mean (Q1(s, a) - y)² + mean (Q2(s, a) - y)²                             → Q1, Q2
+//! Q'  ← (1 - ρ) Q' + ρ Q
+//! ã   = tanh(μ(s) + σ(s) n), n ~ N(0, I)
+//! L_π = mean (α ln π(ã|s) - min(Q1, Q2)(s, ã))                                  → π
+//! L_α = -mean ln α · (ln π(ã|s) + H̄)                                            → α
+//! ```
+//!
+//! ln π(ã|s) = Σ_d ln N(u_d; μ_d, σ_d²) - ln(1 - tanh² u_d), with u = μ + σ n.
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | γ | `discount` | .99 | Haarnoja et al. 2019, Table 1 |
+//! | ρ | `polyak` | .005 | the same |
+//! | - | `lr` | 3e-4, all networks and α, constant | the same |
+//! | - | `hidden` | 256, 256 ReLU | the same; D4RL |
+//! | H̄ | `target_entropy` | -d_a | the same |
+//! | α at the start | `initial_alpha` | 1 | their code |
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::burn::module::Param;
+use tce_nn::{Device, Module, NamedParameters, NetworkError, Tensor, Trained, host};
+
+use crate::actor::{Actor, ActorConfig, PolicyForm};
+use crate::buffer::{Buffer, Minibatch};
+use crate::critic::Twins;
+use crate::error::{LearnError, within};
+use crate::losses::member_mean;
+use crate::policy::Policy;
+use crate::training::{Learner, Meter, PolicyLearner};
+
+/// The configuration of [`Sac`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SacConfig {
+    /// γ
+    pub discount: f64,
+    /// ρ
+    pub polyak: f64,
+    /// Learning rate.
+    pub lr: f64,
+    /// Hidden layers of policy and critics.
+    pub hidden: Vec<usize>,
+    /// H̄; none means -d_a.
+    pub target_entropy: Option<f64>,
+    /// α before the first step.
+    pub initial_alpha: f64,
+}
+
+impl Default for SacConfig {
+    fn default() -> Self {
+        let hidden = vec![256, 256];
+        Self { discount: 0.99, polyak: 0.005, lr: 3e-4, hidden, target_entropy: None, initial_alpha: 1.0 }
+    }
+}
+
+/// ln α of every member, `[P, 1, 1]`.
+#[derive(Module, Debug)]
+struct Temperature {
+    log_alpha: Param<Tensor<3>>,
+}
+
+/// SAC of a population.
+pub struct Sac {
+    config: SacConfig,
+    target_entropy: f64,
+    actor: Actor,
+    critics: Twins,
+    temperature: Trained<Temperature>,
+    members: Vec<Streams>,
+}
+
+impl Sac {
+    /// New networks for the members of `buffer`, whose rows may grow while it learns.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used.
+    pub fn new(buffer: &Buffer, config: &SacConfig, device: &Device) -> Result<Self, LearnError> {
+        within("discount", config.discount, 0.0..=1.0)?;
+        within("polyak", config.polyak, 0.0..=1.0)?;
+        within("initial_alpha", config.initial_alpha, f64::MIN_POSITIVE..=1e6)?;
+        let form = PolicyForm::TanhGaussian;
+        let actor =
+            ActorConfig { form, hidden: config.hidden.clone(), lr: config.lr, cosine: false, ..Default::default() };
+        let members = buffer.streams();
+        let trainable = device.clone().autodiff();
+        let log_alpha = Tensor::full([members.len(), 1, 1], config.initial_alpha.ln(), &trainable);
+        Ok(Self {
+            target_entropy: config.target_entropy.unwrap_or(-(buffer.act_dim() as f64)),
+            actor: Actor::new(buffer, &actor, 0, device)?,
+            critics: Twins::new(buffer.inputs().len(), buffer.act_dim(), &config.hidden, &members, &trainable),
+            temperature: Trained::new(Temperature { log_alpha: Param::from_tensor(log_alpha) }),
+            members,
+            config: config.clone(),
+        })
+    }
+
+    /// α per member.
+    pub fn alpha(&self) -> Vec<f32> {
+        host(self.temperature.net().log_alpha.val().exp())
+    }
+}
+
+impl Learner for Sac {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, target_entropy, actor, critics, temperature, members } = self;
+        let alpha = temperature.net().log_alpha.val().inner().exp();
+        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
+
+        // L_Q; the policy at s is computed meanwhile, for it needs nothing of it.
+        let (y, (output, drawn)) = rayon::join(
+            || {
+                let (a2, log_prob) = actor.frozen(batch.s2.clone()).sample_with_log_prob(members, "next action", step);
+                let (s2a2, [one, two]) = (join(&batch.s2, a2), &critics.pair);
+                let q = one.target(s2a2.clone()).min_pair(two.target(s2a2));
+                batch.r.clone() + batch.not_done.clone() * (q - alpha.clone() * log_prob) * c.discount
+            },
+            || {
+                let output = actor.forward(batch.s.clone());
+                let drawn = output.sample_with_log_prob(members, "action", step);
+                (output, drawn)
+            },
+        );
+        drop(output);
+        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.lr, c.polyak);
+        meter.record("critic_loss", &loss);
+
+        // L_π: gradients reach the action through the critics, whose weights stay.
+        let (a, log_prob) = drawn;
+        let sa = join(&batch.s, a);
+        let [one, two] = &critics.pair;
+        let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));
+        drop(sa);
+        let entropy = log_prob.clone().inner();
+        let loss = member_mean(log_prob * alpha.clone() - q1.min_pair(q2));
+        meter.record("policy_loss", &loss);
+        actor.step(loss, step);
+
+        // L_α
+        let error = member_mean(entropy.clone() + *target_entropy);
+        temperature.step((temperature.net().log_alpha.val() * error).sum().neg(), c.lr);
+        meter.record("entropy", &entropy.neg());
+        meter.record("alpha", &alpha);
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.actor.save(&mut state);
+        self.critics.save(&mut state);
+        self.temperature.save("temperature", &mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.actor.load(state, path)?;
+        self.critics.load(state, path)?;
+        self.temperature.load("temperature", state, path)
+    }
+}
+
+impl PolicyLearner for Sac {
+    fn policies(&self) -> Vec<Policy> {
+        self.actor.policies()
+    }
+}
