@@ -115,6 +115,24 @@ impl Buffer {
         Ok(Self { members, batch, inputs, act_dim: dims.1 })
     }
 
+    /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent that acts. Observations
+    /// reach the networks as they are, without the dimensions `dead`. Draw from it once it has `batch` rows or more.
+    pub fn replay(streams: Streams, dims: (usize, usize), dead: Vec<usize>, batch: usize) -> Self {
+        let standardizer = Standardizer { dead, ..Standardizer::identity(dims.0) };
+        let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
+        let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
+        let member = Member { streams, parts, standardizer, reward_scale: 1.0 };
+        Self { members: vec![member], batch, inputs, act_dim: dims.1 }
+    }
+
+    /// The table of a replay buffer, to add rows to.
+    ///
+    /// # Panics
+    /// If the table of the first member is shared.
+    pub fn replay_mut(&mut self) -> &mut Transitions {
+        Arc::get_mut(&mut self.members[0].parts[0]).expect("a replay table has one owner")
+    }
+
     /// The members.
     pub fn members(&self) -> &[Member] {
         &self.members

@@ -25,7 +25,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::module::Param;
-use tce_nn::{Device, Module, NamedParameters, NetworkError, Tensor, Trained, host};
+use tce_nn::{Device, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
@@ -74,6 +74,7 @@ pub struct Sac {
     critics: Twins,
     temperature: Trained<Temperature>,
     members: Vec<Streams>,
+    device: Device,
 }
 
 impl Sac {
@@ -97,8 +98,22 @@ impl Sac {
             critics: Twins::new(buffer.inputs().len(), buffer.act_dim(), &config.hidden, &members, &trainable),
             temperature: Trained::new(Temperature { log_alpha: Param::from_tensor(log_alpha) }),
             members,
+            device: device.clone(),
             config: config.clone(),
         })
+    }
+
+    /// One action per member for one observation per member, `[P, inputs]` as the networks see it: sampled, with the
+    /// noise `step` of each member's stream `exploration`. Row-major `[P, d_a]`.
+    pub fn act(&self, observations: &[f32], step: u64) -> Vec<f32> {
+        let p = self.members.len();
+        let s = tensor(observations.to_vec(), [p, 1, observations.len() / p], &self.device);
+        host(self.actor.frozen(s).sample_with_log_prob(&self.members, "exploration", step).0)
+    }
+
+    /// Where it computes; batches are made there.
+    pub fn device(&self) -> Device {
+        self.device.clone()
     }
 
     /// α per member.
@@ -109,7 +124,7 @@ impl Sac {
 
 impl Learner for Sac {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, target_entropy, actor, critics, temperature, members } = self;
+        let Self { config: c, target_entropy, actor, critics, temperature, members, .. } = self;
         let alpha = temperature.net().log_alpha.val().inner().exp();
         let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
 

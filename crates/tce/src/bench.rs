@@ -18,6 +18,7 @@ use tce_diffusion::{
     uniform_labels,
 };
 use tce_learn::cvae::{CvaeConfig, CvaeLearner};
+use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{
     Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, Learner, Member, Regulariser,
     RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
@@ -57,6 +58,7 @@ const WORKLOADS: &[Workload] = &[
     ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", || iql(1, RegulariserKind::None)),
     ("iql-5", "the same, five seeds side by side (members' updates)", || iql(5, RegulariserKind::None)),
     ("iql-kl", "IQL with the forward-KL term of Eq. 10", || iql(1, RegulariserKind::ForwardKl)),
+    ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
     ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", || score_eval(1024)),
@@ -214,6 +216,16 @@ fn iql(seeds: u64, kind: RegulariserKind) -> Body {
     learning(members(seeds).into_iter().map(lane).collect(), 2.0 * BATCH as f64 * products)
 }
 
+fn sac() -> Body {
+    let buffer = Buffer::new(members(1), BATCH).expect("good data");
+    let learner = Sac::new(&buffer, &SacConfig::default(), &cpu()).expect("defaults");
+    let (q, q1) = row_products(&[OBS + ACT, WIDTH, WIDTH, 1]);
+    let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, 2 * ACT]);
+    // Policy at s' and s, with its gradient; critics: target, online, gradient, and to the action and back.
+    let products = (4.0 * pi - pi1) + 2.0 * (q + 3.0 * q - q1 + 2.0 * q);
+    learning(vec![(buffer, learner)], 2.0 * BATCH as f64 * products)
+}
+
 fn bc() -> Body {
     let buffer = Buffer::new(members(1), BATCH).expect("good data");
     let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, &cpu()).expect("defaults");
@@ -343,7 +355,7 @@ mod tests {
 
     #[test]
     fn every_workload_runs() {
-        for name in ["iql", "iql-kl", "score-train", "score-eval-1k", "cvae", "labels", "env-hopper"] {
+        for name in ["iql", "iql-kl", "sac", "score-train", "score-eval-1k", "cvae", "labels", "env-hopper"] {
             let m = measure(name, 1, 0.0).unwrap();
             assert!(m.per_second > 0.0 && m.range == [m.per_second; 2], "{name}");
         }

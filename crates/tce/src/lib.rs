@@ -1,5 +1,6 @@
 //! The `tce` program as a library: tasks, presets and variants, the pipeline's stages, run directories and commands.
 
+mod acting;
 mod actors;
 mod bench;
 mod commands;

@@ -16,6 +16,7 @@ mod diagnose;
 mod evaluate;
 mod learn;
 mod run;
+mod train_sac;
 
 /// Cross-domain offline reinforcement learning: a policy for a changed robot from many transitions of the old one and
 /// few of the new one.
@@ -42,6 +43,8 @@ enum Command {
     Learn(learn::Learn),
     /// Roll a policy out and report its returns.
     Evaluate(evaluate::Evaluate),
+    /// Train agents by soft actor-critic in the simulator: actors for data of any quality.
+    TrainSac(train_sac::TrainSac),
     /// Roll trained actors out into a data set.
     Collect(collect::Collect),
     /// Look at, check and convert data sets.
@@ -73,6 +76,7 @@ impl Cli {
             Command::Augment(args) => args.run(output),
             Command::Learn(args) => args.run(output),
             Command::Evaluate(args) => args.run(output),
+            Command::TrainSac(args) => args.run(output),
             Command::Collect(args) => args.run(output),
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),

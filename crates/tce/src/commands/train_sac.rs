@@ -1,0 +1,137 @@
+//! `tce train-sac`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use rayon::prelude::*;
+use serde::Serialize;
+use tce_data::{Agent, Shift, save_d4rl};
+use tce_learn::sac::SacConfig;
+use tce_nn::cpu;
+
+use crate::acting::{Goal, Ledger, Settings, Training};
+use crate::error::{Error, Result};
+use crate::output::{Output, table};
+use crate::task::parse_environment;
+
+/// Steps of a training before the next one's turn.
+const TURN: u64 = 200;
+
+/// Arguments of `train-sac`.
+#[derive(Debug, Args)]
+pub struct TrainSac {
+    /// Environments: hopper (source), hopper-morph, ant-gravity, ...; several are trained side by side.
+    #[arg(required = true, value_parser = parse_environment)]
+    environments: Vec<(Agent, Shift)>,
+    /// Environment steps in all; a training that is there goes on to so many.
+    #[arg(long, default_value_t = 1_000_000)]
+    steps: u64,
+    /// End at the first evaluation with this normalised score.
+    #[arg(long)]
+    until_score: Option<f64>,
+    /// Keep the policy of the first evaluation at each of these scores.
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
+    snapshot_scores: Vec<f64>,
+    /// Trainings per environment, with seeds from --seed on.
+    #[arg(long, default_value_t = 1)]
+    seeds: u64,
+    /// The first seed.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Directory of the trainings, one below it for each.
+    #[arg(long, default_value = "runs/sac")]
+    out: PathBuf,
+    /// Uniformly random actions before the first update.
+    #[arg(long, default_value_t = 10_000)]
+    start: u64,
+    /// Steps between evaluations.
+    #[arg(long, default_value_t = 10_000)]
+    evaluate_every: u64,
+    /// Episodes of an evaluation, with sampled actions.
+    #[arg(long, default_value_t = 20)]
+    episodes: usize,
+    /// Steps between checkpoints.
+    #[arg(long, default_value_t = 50_000)]
+    checkpoint_every: u64,
+    /// At the end, write the replay buffers into the trainings' directories, in D4RL's layout (medium-replay).
+    #[arg(long)]
+    replay: bool,
+}
+
+#[derive(Serialize)]
+struct Row {
+    environment: String,
+    seed: u64,
+    directory: PathBuf,
+    #[serde(flatten)]
+    ledger: Ledger,
+    steps_per_second: f64,
+}
+
+impl TrainSac {
+    /// Runs the command.
+    pub fn run(self, output: Output) -> Result<()> {
+        if self.seeds == 0 || self.episodes == 0 || self.evaluate_every == 0 || self.start == 0 {
+            let message = "--seeds, --episodes, --evaluate-every and --start must be at least 1";
+            return Err(Error::Usage(message.into()));
+        }
+        let goal = Goal {
+            steps: self.steps,
+            until: self.until_score,
+            snapshots: self.snapshot_scores,
+            checkpoint_every: self.checkpoint_every,
+        };
+        let mut trainings = Vec::new();
+        for &(agent, shift) in &self.environments {
+            for seed in self.seed..self.seed + self.seeds {
+                let settings = Settings {
+                    agent,
+                    shift,
+                    seed,
+                    start: self.start,
+                    batch: 256,
+                    evaluate_every: self.evaluate_every,
+                    episodes: self.episodes,
+                    sac: SacConfig::default(),
+                };
+                let directory = self.out.join(format!("{agent}-{shift}-seed{seed}"));
+                let training = Training::open(&directory, settings, goal.clone(), &cpu())?;
+                trainings.push((format!("{agent}-{shift}"), seed, directory, training));
+            }
+        }
+        let started = std::time::Instant::now();
+        let before: Vec<u64> = trainings.iter().map(|t| t.3.ledger().step).collect();
+        while trainings.iter().any(|t| !t.3.finished()) {
+            trainings.par_iter_mut().try_for_each(|t| t.3.advance(TURN))?;
+        }
+        let seconds = started.elapsed().as_secs_f64();
+        let mut rows = Vec::new();
+        for ((environment, seed, directory, training), before) in trainings.into_iter().zip(before) {
+            if self.replay {
+                save_d4rl(&directory.join("medium-replay.hdf5"), training.replay(), &Default::default(), &[])?;
+            }
+            let ledger = training.ledger().clone();
+            let steps_per_second = (ledger.step - before) as f64 / seconds;
+            rows.push(Row { environment, seed, directory, ledger, steps_per_second });
+        }
+        if tce_base::interrupted() {
+            return Err(Error::Interrupted);
+        }
+        output.print(&rows, |rows| {
+            let lines = rows.iter().map(|r| {
+                let last = r.ledger.evaluations.last();
+                [
+                    format!("{} seed {}", r.environment, r.seed),
+                    r.ledger.step.to_string(),
+                    last.map_or("-".into(), |e| format!("{:.0} ± {:.0}", e.mean, e.std)),
+                    last.map_or("-".into(), |e| format!("{:.1}", e.score)),
+                    r.ledger.snapshots.len().to_string(),
+                    format!("{:.0}", r.steps_per_second),
+                    r.directory.display().to_string(),
+                ]
+            });
+            table(&["training", "steps", "return", "score", "snapshots", "steps/s", "directory"], lines)
+        });
+        Ok(())
+    }
+}

@@ -1,0 +1,73 @@
+//! Agents that act and learn, through the real binary.
+
+mod common;
+
+use std::fs;
+use std::process::Output;
+
+use common::{tce, tce_json};
+use tce_data::{LoadOptions, load};
+
+/// What was printed on stderr, with the frame around it and the line breaks taken out.
+fn message(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+const SMALL: &[&str] = &["--start", "120", "--evaluate-every", "100", "--episodes", "2", "--checkpoint-every", "60"];
+
+#[test]
+fn a_training_in_two_pieces_ends_with_the_bytes_of_one_in_one_piece() {
+    let dir = tempfile::tempdir().unwrap();
+    let train = |out: &str, steps: &str, threads: &str| {
+        let args = ["train-sac", "hopper", "--steps", steps, "--out", out, "--threads", threads, "--replay"];
+        tce_json(dir.path(), &[&args[..], SMALL, &["--snapshot-scores", "-50,0"]].concat())
+    };
+    let whole = train("whole", "400", "1");
+    let first = train("pieces", "200", "2");
+    assert!(first[0]["step"].as_u64().unwrap() < whole[0]["step"].as_u64().unwrap());
+    let second = train("pieces", "400", "2");
+    for key in ["step", "episode", "evaluations", "snapshots", "files"] {
+        assert_eq!(whole[0][key], second[0][key], "{key}");
+    }
+    assert!(whole[0]["evaluations"].as_array().unwrap().len() >= 4);
+    for file in ["policy.safetensors", "policy--50.safetensors", "medium-replay.hdf5"] {
+        let bytes =
+            ["whole", "pieces"].map(|o| fs::read(dir.path().join(o).join("hopper-source-seed0").join(file)).unwrap());
+        assert!(bytes[0] == bytes[1], "{file} differs");
+    }
+    let place = dir.path().join("whole/hopper-source-seed0");
+    let replay = load(&place.join("medium-replay.hdf5"), &LoadOptions::default()).unwrap().transitions;
+    assert_eq!(replay.len() as u64, whole[0]["step"].as_u64().unwrap());
+    // Every checkpoint but the last is gone.
+    let kept = fs::read_dir(&place)
+        .unwrap()
+        .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("replay-"));
+    assert_eq!(kept.count(), 1);
+
+    // The policy is one like any other.
+    let policy = place.join("policy.safetensors");
+    let judged = tce_json(dir.path(), &["evaluate", policy.to_str().unwrap(), "--env", "hopper", "--episodes", "2"]);
+    assert_eq!(judged[0]["returns"].as_array().unwrap().len(), 2);
+}
+
+#[test]
+fn another_training_in_the_same_place_and_a_damaged_checkpoint_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let args = |start: &'static str| {
+        ["train-sac", "hopper", "--steps", "60", "--episodes", "1", "--evaluate-every", "50", "--start", start].to_vec()
+    };
+    assert!(tce(dir.path(), &args("40")).status.success());
+    let other = tce(dir.path(), &args("41"));
+    assert_eq!(other.status.code(), Some(2));
+    assert!(message(&other).contains("the training there has other settings"), "{}", message(&other));
+
+    let place = dir.path().join("runs/sac/hopper-source-seed0");
+    let mut files = fs::read_dir(&place).unwrap().map(|e| e.unwrap().path());
+    let learner = files.find(|p| p.to_string_lossy().contains("learner-")).unwrap();
+    let mut bytes = fs::read(&learner).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&learner, bytes).unwrap();
+    let damaged = tce(dir.path(), &args("40"));
+    assert_eq!(damaged.status.code(), Some(1));
+    assert!(message(&damaged).contains("not what the ledger says"), "{}", message(&damaged));
+}
