@@ -285,6 +285,7 @@ unsafe fn tiles<V: Simd, const MR: usize, const NV: usize>(
 
 /// The same pointer, in a register of its own.
 #[inline(always)]
+#[allow(clippy::pointers_in_nomem_asm_block)] // the pointer is passed through, not followed
 fn opaque(mut pointer: *const f32) -> *const f32 {
     #[cfg(not(miri))]
     // SAFETY: no instruction at all.
