@@ -133,7 +133,14 @@ impl Policy {
         if path.extension().is_some_and(|e| e == "npz") {
             return crate::import::load_npz(path);
         }
-        let parameters = NamedParameters::load(path)?;
+        Self::from_parameters(&NamedParameters::load(path)?, path)
+    }
+
+    /// The policy of a file that was read before; `path` is for messages.
+    ///
+    /// # Errors
+    /// If it is not a policy.
+    pub fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
         let fault = |found: String| LearnError::Policy {
             path: path.to_owned(),
             field: KEY.into(),
@@ -143,7 +150,7 @@ impl Policy {
         };
         let text = parameters.metadata.get(KEY).ok_or_else(|| fault("nothing".into()))?;
         let spec = serde_json::from_str(text).map_err(|e| fault(e.to_string()))?;
-        Self::new(spec, &parameters, KEY, path)
+        Self::new(spec, parameters, KEY, path)
     }
 
     /// The weights and, in the metadata, the specification. Callers may add metadata of their own before saving.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams, interrupted, random::fill_normal};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
 
@@ -46,10 +47,11 @@ pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 
 }
 
 /// Means of named figures, per member.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Meter {
+    #[serde(skip)]
     active: bool,
-    sums: BTreeMap<&'static str, (Vec<f64>, u64)>,
+    sums: BTreeMap<String, (Vec<f64>, u64)>,
 }
 
 impl Meter {
@@ -78,7 +80,7 @@ impl Meter {
     }
 
     /// Takes the mean over each member's entries of `value` `[P, ·, ·]`.
-    pub fn record(&mut self, name: &'static str, value: &Tensor<3>) {
+    pub fn record(&mut self, name: &str, value: &Tensor<3>) {
         if self.active {
             let members = value.dims()[0];
             let values = host(value.clone());
@@ -89,14 +91,14 @@ impl Meter {
     }
 
     /// Takes one figure per member.
-    pub fn add(&mut self, name: &'static str, per_member: Vec<f64>) {
-        let (sum, count) = self.sums.entry(name).or_insert_with(|| (vec![0.0; per_member.len()], 0));
+    pub fn add(&mut self, name: &str, per_member: Vec<f64>) {
+        let (sum, count) = self.sums.entry(name.to_owned()).or_insert_with(|| (vec![0.0; per_member.len()], 0));
         sum.iter_mut().zip(per_member).for_each(|(s, v)| *s += v);
         *count += 1;
     }
 
     /// The means since the last call, and starts anew.
-    pub fn take(&mut self) -> BTreeMap<&'static str, Vec<f64>> {
+    pub fn take(&mut self) -> BTreeMap<String, Vec<f64>> {
         let means = |(sum, n): (Vec<f64>, u64)| sum.into_iter().map(|s| s / n as f64).collect();
         std::mem::take(&mut self.sums).into_iter().map(|(name, entry)| (name, means(entry))).collect()
     }
@@ -108,7 +110,7 @@ pub struct Report {
     /// Steps done.
     pub step: u64,
     /// Mean of each figure since the last report, per member.
-    pub metrics: BTreeMap<&'static str, Vec<f64>>,
+    pub metrics: BTreeMap<String, Vec<f64>>,
 }
 
 impl Report {
@@ -256,7 +258,10 @@ mod tests {
 
     #[test]
     fn a_diverged_member_is_named() {
-        let report = Report { step: 1, metrics: BTreeMap::from([("a", vec![1.0, f64::NAN]), ("b", vec![0.0, 0.0])]) };
+        let report = Report {
+            step: 1,
+            metrics: BTreeMap::from([("a".into(), vec![1.0, f64::NAN]), ("b".into(), vec![0.0, 0.0])]),
+        };
         assert_eq!(report.diverged(), [1]);
     }
 }

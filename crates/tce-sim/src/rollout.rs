@@ -282,16 +282,17 @@ impl Lane for Evaluator {
 
 /// Rolls out `episodes` whole episodes in lockstep and returns their outcomes in order. Random numbers come from the
 /// streams `evaluate/reset` and `evaluate/action`, indexed by episode: two policies evaluated with the same streams
-/// start from the same states.
+/// start from the same states. `stop` is asked before every step.
 ///
 /// # Errors
-/// If the actor returns a number that is not finite, or the user interrupts.
+/// If the actor returns a number that is not finite, or `stop` says so.
 pub fn evaluate(
     agent: Agent,
     shift: Shift,
     actor: &dyn Actor,
     episodes: usize,
     streams: Streams,
+    stop: impl Fn() -> bool,
 ) -> Result<Vec<EpisodeResult>, SimError> {
     let model = compiled(agent, shift)?;
     let starts = (0..episodes).map(|index| {
@@ -302,7 +303,7 @@ pub fn evaluate(
     let mut lockstep = Lockstep::new(agent, &model, starts);
     let mut finished = Vec::with_capacity(episodes);
     while !lockstep.lanes.is_empty() {
-        if interrupted() {
+        if stop() {
             return Err(SimError::Interrupted);
         }
         lockstep.tick(actor, &mut finished)?;

@@ -24,7 +24,9 @@ fn the_same_bytes_at_any_number_of_threads() {
         assert_eq!(one.len(), 1003);
         assert!(one != random(agent, 1003, 8, 8), "{agent}: another seed, other rows");
         let scores = |threads| {
-            with_threads(threads, || evaluate(agent, Shift::Morph, &UniformActor, 3, Streams::new(1)).unwrap())
+            with_threads(threads, || {
+                evaluate(agent, Shift::Morph, &UniformActor, 3, Streams::new(1), || false).unwrap()
+            })
         };
         assert_eq!(scores(1), scores(3));
     }
@@ -89,7 +91,7 @@ fn evaluation_steps_only_what_still_runs() {
         sizes.lock().unwrap().push(rngs.len());
         actions.fill(0.4);
     };
-    let results = evaluate(Agent::Hopper, Shift::Source, &actor, 6, Streams::new(0)).unwrap();
+    let results = evaluate(Agent::Hopper, Shift::Source, &actor, 6, Streams::new(0), || false).unwrap();
     let sizes = sizes.into_inner().unwrap();
     assert_eq!(results.len(), 6);
     assert_eq!(sizes.iter().sum::<usize>(), results.iter().map(|r| r.length).sum::<usize>());
@@ -113,14 +115,14 @@ fn evaluation_steps_only_what_still_runs() {
 #[test]
 fn an_episode_ends_after_a_thousand_steps() {
     let still = |_: &[f32], _: &mut [Rng], actions: &mut [f32]| actions.fill(0.0);
-    let results = evaluate(Agent::HalfCheetah, Shift::Source, &still, 2, Streams::new(0)).unwrap();
+    let results = evaluate(Agent::HalfCheetah, Shift::Source, &still, 2, Streams::new(0), || false).unwrap();
     assert!(results.iter().all(|r| r.length == EPISODE_LIMIT && r.episode_return.abs() < 100.0), "{results:?}");
 }
 
 #[test]
 fn an_actor_that_returns_nan_is_refused() {
     let broken = |_: &[f32], _: &mut [Rng], actions: &mut [f32]| actions.fill(f32::NAN);
-    let error = evaluate(Agent::Ant, Shift::Source, &broken, 2, Streams::new(0)).unwrap_err();
+    let error = evaluate(Agent::Ant, Shift::Source, &broken, 2, Streams::new(0), || false).unwrap_err();
     assert!(matches!(error, SimError::NotFinite { row: 0, .. }), "{error}");
     let options = CollectOptions { lanes: 0, ..CollectOptions::new(10, Streams::new(0)) };
     assert!(matches!(collect(Agent::Ant, Shift::Source, &UniformActor, &options), Err(SimError::Option { .. })));

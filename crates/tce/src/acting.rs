@@ -1,16 +1,16 @@
 //! Agents that act and learn: SAC in an environment, at D4RL's specification, in pieces of hours.
 //!
-//! One environment step and one update in turns; the first steps are uniformly random. Everything random is indexed by
-//! step, update or episode, and a checkpoint is taken between episodes, so that a training that was stopped goes on to the
+//! Environment steps and updates in turns (by default one to one); the first steps are uniformly random, or those of the
+//! policy that a training begins with. Everything random is indexed by step, update or episode, and a checkpoint is taken between episodes, so that a training that was stopped goes on to the
 //! same bytes. A directory holds
 //!
 //! | file | content |
 //! |---|---|
 //! | `settings.json` | what decides the training |
-//! | `metrics.jsonl`, `tensorboard/` | figures of the present piece |
+//! | `metrics.jsonl`, `tensorboard/` | losses and evaluations; cut back to the checkpoint when the training goes on |
 //! | `replay-STEP.hdf5`, `learner-STEP.safetensors` | the last checkpoint's replay buffer and networks |
 //! | `ledger.json` | the checkpoint: step, episode, evaluations, snapshots, and the SHA-256 of the two; written last |
-//! | `policy-SCORE.safetensors`, `policy.safetensors` | snapshots and the last policy, each with a card |
+//! | `policy-SCORE.safetensors`, `policy.safetensors` | snapshots, and the policy of the last evaluation, each with a card |
 
 use std::path::{Path, PathBuf};
 
@@ -23,10 +23,11 @@ use tce_learn::{Buffer, Learner, Meter, Policy, PolicyLearner};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::{EPISODE_LIMIT, Env};
 
-use crate::actors::{Evaluation, evaluate};
+use crate::actors::{Evaluation, evaluate_to_the_end};
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
 use crate::output::mean_std;
+use crate::zoo::Card;
 
 /// What decides a training. Its end may be moved when it goes on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -37,10 +38,14 @@ pub struct Settings {
     pub shift: Shift,
     /// Of everything random.
     pub seed: u64,
-    /// Uniformly random actions before the first update.
+    /// Steps before the first update: uniformly random ones, where the networks are new.
     pub start: u64,
+    /// Environment steps per update.
+    pub steps_per_update: u64,
     /// Rows per update.
     pub batch: usize,
+    /// The training whose networks this one began with.
+    pub from: Option<Origin>,
     /// Steps between evaluations.
     pub evaluate_every: u64,
     /// Episodes of an evaluation, with sampled actions.
@@ -71,8 +76,10 @@ pub struct Judged {
     pub mean: f64,
     /// Standard deviation over episodes.
     pub std: f64,
-    /// Normalised; in the source domain by D4RL's references.
-    pub score: f64,
+    /// Mean length of the episodes.
+    pub length: f64,
+    /// Normalised; in the source domain by D4RL's references. None where nobody publishes references.
+    pub score: Option<f64>,
 }
 
 /// A policy that was kept.
@@ -99,6 +106,86 @@ pub struct Ledger {
     pub snapshots: Vec<Snapshot>,
     /// The checkpoint's files and their SHA-256.
     pub files: Vec<(String, String)>,
+    /// Figures since the last evaluation.
+    #[serde(default)]
+    pub meter: Meter,
+}
+
+impl Ledger {
+    /// The ledger of the training in `directory`, if it has a checkpoint.
+    ///
+    /// # Errors
+    /// If it is damaged.
+    pub fn read(directory: &Path) -> Result<Option<Self>> {
+        read_json(&directory.join("ledger.json"))
+    }
+}
+
+/// The content of a JSON file; none if there is no such file.
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>> {
+    match std::fs::read(path) {
+        Ok(bytes) => Ok(Some(serde_json::from_slice(&bytes).map_err(|e| damaged(path, &e))?)),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(FileError::new(path, "read", e).into()),
+    }
+}
+
+/// Two programs in one directory would delete each other's checkpoints.
+fn lock(directory: &Path) -> Result<std::fs::File> {
+    let path = directory.join("lock");
+    let file = std::fs::File::create(&path).map_err(|e| FileError::new(&path, "create", e))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(std::fs::TryLockError::WouldBlock) => Err(Error::Usage(format!(
+            "{}: another training is at work there; let it finish, or give another --out",
+            directory.display()
+        ))),
+        // Some network file systems have no locks.
+        Err(std::fs::TryLockError::Error(_)) => Ok(file),
+    }
+}
+
+/// The training whose networks another one began with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Origin {
+    /// Where it was.
+    pub directory: PathBuf,
+    /// `hopper-source seed 0, step 300000`.
+    pub training: String,
+    /// The file of its networks there.
+    pub file: String,
+    /// SHA-256 of that file.
+    pub sha256: String,
+}
+
+impl Origin {
+    fn of(directory: &Path, agent: Agent) -> Result<Self> {
+        let none = || {
+            let message =
+                "no checkpoint of a training here; give the directory of one, such as runs/sac/hopper-source-seed0";
+            Error::Usage(format!("{}: {message}", directory.display()))
+        };
+        let settings: Settings = read_json(&directory.join("settings.json"))?.ok_or_else(none)?;
+        if settings.agent != agent {
+            let message = "a policy of one robot cannot drive another";
+            return Err(Error::Usage(format!("{}: a training of {}; {message}", directory.display(), settings.agent)));
+        }
+        let ledger = Ledger::read(directory)?.ok_or_else(none)?;
+        let (file, sha256) = ledger.files.into_iter().find(|f| f.0.ends_with(".safetensors")).ok_or_else(none)?;
+        let training = format!("{agent}-{} seed {}, step {}", settings.shift, settings.seed, ledger.step);
+        Ok(Self { directory: directory.to_owned(), training, file, sha256 })
+    }
+
+    fn learner(&self) -> PathBuf {
+        self.directory.join(&self.file)
+    }
+}
+
+fn verify(path: &Path, hash: &str) -> Result<()> {
+    if sha256_file(path)? == hash {
+        return Ok(());
+    }
+    Err(Error::Failed(format!("{}: not what the ledger says; the file was changed", path.display())))
 }
 
 /// A training under way.
@@ -114,49 +201,70 @@ pub struct Training {
     /// The observation, and steps of the present episode.
     observation: Vec<f32>,
     length: usize,
-    meter: Meter,
     metrics: Metrics,
     progress: Progress,
     finished: bool,
+    /// Held as long as the training is open.
+    #[allow(dead_code)]
+    lock: std::fs::File,
 }
 
 impl Training {
-    /// Starts in `directory`, or goes on from the checkpoint there.
+    /// Starts in `directory`, with the networks of the training in `from` if there is one, or goes on from the checkpoint
+    /// there.
     ///
     /// # Errors
-    /// If the directory holds another training, or a damaged checkpoint.
-    pub fn open(directory: &Path, settings: Settings, goal: Goal, device: &Device) -> Result<Self> {
+    /// If the directory is in use, or holds another training or a damaged checkpoint, or `from` holds none.
+    pub fn open(
+        directory: &Path,
+        mut settings: Settings,
+        from: Option<&Path>,
+        goal: Goal,
+        device: &Device,
+    ) -> Result<Self> {
         std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        let lock = lock(directory)?;
         let path = directory.join("settings.json");
-        match std::fs::read(&path) {
-            Ok(bytes) => {
-                let found: Settings = serde_json::from_slice(&bytes).map_err(|e| damaged(&path, &e))?;
-                if found != settings {
-                    return Err(Error::Usage(format!(
-                        "{}: the training there has other settings; give another --out, or the settings it began with",
-                        path.display()
-                    )));
-                }
+        let ledger = Ledger::read(directory)?;
+        if ledger.is_some() {
+            let found: Settings = read_json(&path)?.ok_or_else(|| {
+                Error::Failed(format!("{}: missing, beside a checkpoint; restore the directory", path.display()))
+            })?;
+            if let (Some(from), Some(found)) = (from, &found.from)
+                && from != found.directory
+            {
+                return Err(Error::Usage(format!(
+                    "{}: the training there began with {}, not {}",
+                    path.display(),
+                    found.directory.display(),
+                    from.display()
+                )));
             }
-            Err(_) => write_json(&path, &settings)?,
+            settings.from.clone_from(&found.from);
+            if found != settings || (from.is_some() && found.from.is_none()) {
+                return Err(Error::Usage(format!(
+                    "{}: the training there has other settings; give another --out, or the settings it began with",
+                    path.display()
+                )));
+            }
+        } else {
+            settings.from = from.map(|from| Origin::of(from, settings.agent)).transpose()?;
+            write_json(&path, &settings)?;
         }
-        let ledger = match std::fs::read(directory.join("ledger.json")) {
-            Ok(bytes) => serde_json::from_slice(&bytes).map_err(|e| damaged(&directory.join("ledger.json"), &e))?,
-            Err(_) => Ledger::default(),
-        };
+        let origin = settings.from.as_ref().filter(|_| ledger.is_none()).map(|o| (o.learner(), o.sha256.clone()));
+        let ledger = ledger.unwrap_or_default();
         let (agent, streams) = (settings.agent, Streams::new(settings.seed));
         // Ant's contact slots, which are always 0.
         let dead = if agent == Agent::Ant { (27..111).collect() } else { Vec::new() };
         let mut buffer = Buffer::replay(streams, agent.dims(), dead, settings.batch);
         let mut sac = Sac::new(&buffer, &settings.sac, device)?;
+        if let Some((learner, hash)) = origin {
+            verify(&learner, &hash)?;
+            sac.restore(&NamedParameters::load(&learner)?, &learner)?;
+        }
         for (file, hash) in &ledger.files {
             let path = directory.join(file);
-            if sha256_file(&path)? != *hash {
-                return Err(Error::Failed(format!(
-                    "{}: not what the ledger says; the file was changed",
-                    path.display()
-                )));
-            }
+            verify(&path, hash)?;
             if file.ends_with(".hdf5") {
                 let options = LoadOptions { dims: Some(agent.dims()), ..LoadOptions::default() };
                 *buffer.replay_mut() = load(&path, &options)?.transitions;
@@ -169,8 +277,8 @@ impl Training {
             env: Env::new(agent, settings.shift)?,
             observation: vec![0.0; agent.dims().0],
             length: 0,
-            meter: Meter::always(),
-            metrics: Metrics::start(directory)?,
+            metrics: Metrics::resume(directory, ledger.step)?,
+            lock,
             progress: Progress::new(label, goal.steps.saturating_sub(ledger.step), "steps"),
             saved: ledger.step,
             finished: ledger.step >= goal.steps,
@@ -208,8 +316,8 @@ impl Training {
     }
 
     fn reached(&self) -> bool {
-        let score = self.ledger.evaluations.last().map(|e| e.score);
-        self.goal.until.is_some_and(|until| score.is_some_and(|s| s >= until))
+        let best = self.ledger.evaluations.iter().filter_map(|e| e.score).fold(f64::NEG_INFINITY, f64::max);
+        self.goal.until.is_some_and(|until| best >= until)
     }
 
     /// Some steps; ends with the episode in which the goal is reached or the user interrupts.
@@ -229,7 +337,7 @@ impl Training {
     fn step(&mut self) -> Result<()> {
         let step = self.ledger.step;
         let (streams, (obs_dim, act_dim)) = (Streams::new(self.settings.seed), self.settings.agent.dims());
-        let action = if step < self.settings.start {
+        let action = if step < self.settings.start && self.settings.from.is_none() {
             let mut action = vec![0.0; act_dim];
             fill_uniform(&mut streams.indexed("random action", step), &mut action);
             action.iter_mut().for_each(|a| *a = 2.0 * *a - 1.0);
@@ -249,17 +357,21 @@ impl Training {
         if !result.unstable {
             let (s, reward) = (&self.observation, result.reward as f32);
             self.buffer.replay_mut().push(s, &action, reward, &next, result.terminal, timeout);
+        } else if self.length > 1 {
+            // The physics blew up: the episode ends with the row before.
+            *self.buffer.replay_mut().timeouts.last_mut().expect("this episode's rows") = true;
         }
         self.observation = next;
         self.ledger.step += 1;
         self.progress.inc(1);
-        if self.ledger.step > self.settings.start {
-            let update = self.ledger.step - self.settings.start - 1;
+        let trained = self.ledger.step.saturating_sub(self.settings.start);
+        if trained > 0 && trained.is_multiple_of(self.settings.steps_per_update) {
+            let update = trained / self.settings.steps_per_update - 1;
             let batch = self.buffer.sample(update, &self.sac.device());
             // Figures cost time, and their means need no more than every tenth.
-            let mut unused = Meter::default();
-            let meter = if update.is_multiple_of(10) { &mut self.meter } else { &mut unused };
-            self.sac.update(&batch, update, meter);
+            let mut meter = if update.is_multiple_of(10) { Meter::always() } else { Meter::default() };
+            self.sac.update(&batch, update, &mut meter);
+            self.ledger.meter.join(meter);
         }
         if self.ledger.step.is_multiple_of(self.settings.evaluate_every) {
             self.judge()?;
@@ -281,14 +393,21 @@ impl Training {
         let policy = self.sac.policies().remove(0);
         let reference = reference_scores(agent, shift, ScoreTable::default());
         let streams = Streams::new(seed ^ self.ledger.step);
-        let evaluation = evaluate(&policy, agent, shift, episodes, streams, false, reference)?;
+        // To its end even when the user interrupts: the checkpoint that follows needs it.
+        let evaluation = evaluate_to_the_end(&policy, agent, shift, episodes, streams, reference)?;
         let judged = judged(&evaluation, self.ledger.step);
-        let figures: Vec<_> = self.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
+        let figures: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
+        let figures = figures.iter().map(|(name, value)| (name.as_str(), *value));
         self.metrics.log("sac", self.ledger.step, 0, figures)?;
-        self.metrics.log("evaluate", self.ledger.step, 0, [("return", judged.mean), ("score", judged.score)])?;
-        self.progress.message(format!("return {:.0}, score {:.1}", judged.mean, judged.score));
+        let figures = [("return", Some(judged.mean)), ("length", Some(judged.length)), ("score", judged.score)];
+        let figures = figures.into_iter().filter_map(|(name, value)| Some((name, value?)));
+        self.metrics.log("evaluate", self.ledger.step, 0, figures)?;
+        let score = judged.score.map_or(String::new(), |s| format!(", score {s:.1}"));
+        self.progress.message(format!("return {:.0}{score}", judged.mean));
+        // Here and not with the checkpoint: some updates later it is another policy than the one judged.
+        save_card(&policy, &self.directory.join("policy.safetensors"), &self.settings, &judged)?;
         for &at in &self.goal.snapshots {
-            if judged.score >= at && self.ledger.snapshots.iter().all(|s| s.at != at) {
+            if judged.score.is_some_and(|s| s >= at) && self.ledger.snapshots.iter().all(|s| s.at != at) {
                 let file = format!("policy-{at}.safetensors");
                 save_card(&policy, &self.directory.join(&file), &self.settings, &judged)?;
                 self.ledger.snapshots.push(Snapshot { at, judged: judged.clone(), file });
@@ -303,17 +422,17 @@ impl Training {
         let (replay, learner) = (format!("replay-{step}.hdf5"), format!("learner-{step}.safetensors"));
         save_d4rl(&self.directory.join(&replay), self.replay(), &Default::default(), &[])?;
         self.sac.state().save(&self.directory.join(&learner))?;
-        if let Some(judged) = self.ledger.evaluations.last() {
-            let policy = self.sac.policies().remove(0);
-            save_card(&policy, &self.directory.join("policy.safetensors"), &self.settings, judged)?;
-        }
         let hashed = |name: String| Ok((name.clone(), sha256_file(&self.directory.join(&name))?));
         let files = [replay, learner].into_iter().map(hashed).collect::<Result<Vec<_>>>()?;
-        let old = std::mem::replace(&mut self.ledger.files, files);
+        self.ledger.files = files;
         write_json(&self.directory.join("ledger.json"), &self.ledger)?;
-        for (name, _) in old.into_iter().filter(|o| !self.ledger.files.contains(o)) {
-            // The new checkpoint is whole: an old one that cannot be removed costs space only.
-            let _ = std::fs::remove_file(self.directory.join(name));
+        // The new checkpoint is whole: older ones, and what a killed program left, cost space only.
+        for entry in std::fs::read_dir(&self.directory).into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let ours = name.starts_with("replay-") || name.starts_with("learner-") || name.ends_with(".part");
+            if ours && self.ledger.files.iter().all(|(kept, _)| *kept != name) {
+                let _ = std::fs::remove_file(entry.path());
+            }
         }
         self.saved = step;
         Ok(())
@@ -326,39 +445,27 @@ fn damaged(path: &Path, error: &serde_json::Error) -> Error {
 
 fn judged(evaluation: &Evaluation, step: u64) -> Judged {
     let (mean, std) = mean_std(&evaluation.returns);
-    Judged { step, mean, std, score: evaluation.score.unwrap_or(f64::NAN) }
+    Judged { step, mean, std, length: evaluation.mean_length(), score: evaluation.score }
 }
-
-/// What a policy's file says about where it comes from.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Card {
-    /// The robot.
-    pub agent: Agent,
-    /// The domain it was trained in.
-    pub shift: Shift,
-    /// Of the training.
-    pub seed: u64,
-    /// How it did, and after how many environment steps.
-    pub judged: Judged,
-    /// Episodes of that evaluation.
-    pub episodes: usize,
-    /// The program that trained it.
-    pub program: String,
-}
-
-/// Key of the card in a policy file's metadata.
-const CARD: &str = "card";
 
 fn save_card(policy: &Policy, path: &Path, settings: &Settings, judged: &Judged) -> Result<()> {
     let card = Card {
         agent: settings.agent,
         shift: settings.shift,
+        role: None,
         seed: settings.seed,
-        judged: judged.clone(),
+        steps: judged.step,
+        updates: judged.step.saturating_sub(settings.start) / settings.steps_per_update,
+        batch: settings.batch,
+        from: settings.from.as_ref().map(|o| o.training.clone()),
         episodes: settings.episodes,
+        mean: judged.mean,
+        std: judged.std,
+        length: judged.length,
+        score: judged.score,
         program: format!("tce {}", env!("CARGO_PKG_VERSION")),
     };
     let mut parameters = policy.to_parameters();
-    parameters.metadata.insert(CARD.into(), serde_json::to_string(&card).expect("plain data"));
+    card.attach(&mut parameters);
     Ok(parameters.save(path)?)
 }

@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{Progress, Rng, Streams, sha256_file, sha256_hex};
+use tce_base::{Progress, Rng, Streams, interrupted, sha256_file, sha256_hex};
 use tce_data::{Agent, Quality, ReferenceScores, Shift, Transitions, save_d4rl};
 use tce_learn::Policy;
 use tce_sim::{Actor, CollectOptions, EpisodeResult};
 
 use crate::error::{Error, Result};
+use crate::zoo::Exhibit;
 
 /// A policy as the simulator wants it.
 pub struct PolicyActor {
@@ -30,9 +31,12 @@ impl Actor for PolicyActor {
     }
 }
 
-/// Loads a policy and checks that it is one for `agent`.
+/// Loads a policy, from a file or as `zoo:NAME`, and checks that it is one for `agent`.
 pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
-    let policy = Policy::load(path)?;
+    let policy = match Exhibit::at(path)? {
+        Some(exhibit) => exhibit.policy()?,
+        None => Policy::load(path)?,
+    };
     let spec = policy.spec();
     let (found, expected) = ((spec.observations, spec.actions), agent.dims());
     if found != expected {
@@ -51,7 +55,7 @@ pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
 /// One actor's part in a data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Part {
-    /// The policy's file.
+    /// The policy's file, or `zoo:NAME`.
     pub actor: PathBuf,
     /// Its share of the rows, relative to the other parts'.
     pub weight: f64,
@@ -111,7 +115,11 @@ impl Recipe {
         attributes.insert("shift".to_owned(), self.shift.to_string());
         attributes.insert("program".to_owned(), format!("tce {}", env!("CARGO_PKG_VERSION")));
         for (k, part) in self.parts.iter().enumerate() {
-            attributes.insert(format!("actor_{k}_sha256"), sha256_file(&part.actor)?);
+            let hash = match Exhibit::at(&part.actor)? {
+                Some(exhibit) => exhibit.sha256(),
+                None => sha256_file(&part.actor)?,
+            };
+            attributes.insert(format!("actor_{k}_sha256"), hash);
         }
         Ok(attributes)
     }
@@ -128,89 +136,62 @@ impl Recipe {
     }
 }
 
-/// Rows of D4RL's data sets, and the stand-in actors under `shared/policies` that come closest to their behaviour: until
-/// the project has actors of its own. Weights are calibrated so that mean returns are within 10 % of D4RL's.
-pub fn stand_in(agent: Agent, quality: Quality, rows: usize, seed: u64, shared: &Path) -> Result<Recipe> {
-    use Agent::*;
-    let medium: &[(&str, f64)] = match agent {
-        HalfCheetah => &[("yth_sac_halfcheetah_seed1_B_20201001_0803_e9a4951", 1.0)],
-        Hopper => &[("zoo_sac_hopper_final", 0.7), ("yth_sac_hopper_seed4_C_20201001_0828_6ebb228", 0.3)],
-        Walker2d => &[("yth_sac_walker2d_seed4_D_20201002_0053_baba2dc", 0.56), ("zoo_tqc_walker2d_final", 0.44)],
-        Ant => &[("yth_sac_ant_seed0_A_20201001_0516_32b71a2", 1.0)],
-    };
-    let expert: &[(&str, f64)] = match agent {
-        HalfCheetah => &[("yth_sac_halfcheetah_seed3_D_20201002_0053_baba2dc", 1.0)],
-        Hopper => &[("yth_sac_hopper_seed2_D_20201002_0053_baba2dc", 1.0)],
-        Walker2d => &[("yth_sac_walker2d_seed5_D_20201002_0053_baba2dc", 1.0)],
-        Ant => &[("yth_sac_ant_seed5_D_20201002_0053_baba2dc", 1.0)],
-    };
-    // Early stages of training, then the medium actor: the shape of a replay buffer.
-    let replay: &[(&str, f64)] = match agent {
-        HalfCheetah => &[
-            ("yth_sac_halfcheetah_seed5_B_20201001_0803_e9a4951", 0.15),
-            ("yth_sac_halfcheetah_seed3_B_20201001_0803_e9a4951", 0.2),
-            ("yth_sac_halfcheetah_seed4_B_20201001_0803_e9a4951", 0.3),
-            ("yth_sac_halfcheetah_seed1_B_20201001_0803_e9a4951", 0.35),
-        ],
-        Hopper => &[
-            ("yth_sac_hopper_seed1_B_20201001_0803_e9a4951", 0.25),
-            ("yth_sac_hopper_seed3_C_20201001_0828_6ebb228", 0.25),
-            ("yth_sac_hopper_seed2_C_20201001_0828_6ebb228", 0.25),
-            ("yth_sac_hopper_seed4_C_20201001_0828_6ebb228", 0.25),
-        ],
-        Walker2d => &[
-            ("yth_sac_walker2d_seed1_B_20201001_0803_e9a4951", 0.15),
-            ("yth_sac_walker2d_seed4_C_20201001_0828_6ebb228", 0.15),
-            ("yth_sac_walker2d_seed3_C_20201001_0828_6ebb228", 0.15),
-            ("yth_sac_walker2d_seed1_C_20201001_0828_6ebb228", 0.25),
-            ("yth_sac_walker2d_seed4_D_20201002_0053_baba2dc", 0.3),
-        ],
-        Ant => &[
-            ("yth_sac_ant_seed1_B_20201001_0803_e9a4951", 0.3),
-            ("yth_sac_ant_seed1_C_20201001_0828_6ebb228", 0.4),
-            ("yth_sac_ant_seed0_A_20201001_0516_32b71a2", 0.3),
-        ],
-    };
-    let (parts, rows) = match quality {
-        Quality::Medium => (medium.to_vec(), rows),
-        Quality::Expert => (expert.to_vec(), rows),
-        Quality::MediumExpert => {
-            let share = |actors: &[(&'static str, f64)]| actors.to_vec();
-            let mut parts = share(medium);
-            parts.extend(share(expert));
-            (parts, 2 * rows)
-        }
-        Quality::MediumReplay => {
-            // D4RL's buffers hold 202k, 402k, 302k and 302k rows beside 1M of medium.
-            let share = match agent {
-                HalfCheetah => 0.202,
-                Hopper => 0.402,
-                Walker2d | Ant => 0.302,
-            };
-            (replay.to_vec(), (rows as f64 * share) as usize)
-        }
-    };
-    let parts = parts
-        .into_iter()
-        .map(|(name, weight)| {
-            let actor = shared.join(format!("policies/{name}.npz"));
-            if actor.exists() {
-                Ok(Part { actor, weight })
-            } else {
-                Err(Error::missing(
-                    &actor,
-                    "this stand-in actor is not there; set TCE_SHARED to the folder that holds policies/, or give \
-                     source data with --source",
-                ))
-            }
-        })
-        .collect::<Result<_>>()?;
-    Ok(Recipe { agent, shift: Shift::Source, parts, rows, mean: false, lanes: 32, seed })
+/// Who acts in the data sets of one robot in one domain; a part for which nobody is there is empty.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Cast {
+    /// D4RL's medium behaviour.
+    pub medium: Vec<Part>,
+    /// D4RL's expert behaviour.
+    pub expert: Vec<Part>,
+    /// The policies of a training until the medium level.
+    pub replay: Vec<Part>,
 }
 
-/// The folder with stand-in actors and the public target sets: `TCE_SHARED`, by default `../shared`.
-pub fn shared_folder() -> PathBuf {
-    std::env::var_os("TCE_SHARED").map_or_else(|| PathBuf::from("../shared"), PathBuf::from)
+/// Rows of a target set (OTDF).
+pub const TARGET_ROWS: usize = 5000;
+
+impl Cast {
+    /// D4RL's source data of this quality, `rows` for medium or expert: twice as many for both one after the other, and for a replay
+    /// buffer the share that D4RL's have. None if an actor is missing.
+    pub fn source(self, agent: Agent, shift: Shift, quality: Quality, rows: usize, seed: u64) -> Option<Recipe> {
+        let rows = match quality {
+            Quality::Medium | Quality::Expert => rows,
+            Quality::MediumExpert => 2 * rows,
+            Quality::MediumReplay => {
+                // D4RL's buffers hold 202k, 402k, 302k and 302k rows beside 1M of medium.
+                let share = match agent {
+                    Agent::HalfCheetah => 0.202,
+                    Agent::Hopper => 0.402,
+                    Agent::Walker2d | Agent::Ant => 0.302,
+                };
+                (rows as f64 * share) as usize
+            }
+        };
+        let parts = self.parts(quality, [1.0, 1.0])?;
+        Some(Recipe { agent, shift, parts, rows, mean: false, lanes: 32, seed })
+    }
+
+    /// A target set as OTDF's are: [`TARGET_ROWS`] rows of whole episodes but the last; medium-expert is two parts of medium to
+    /// three of expert, and its successors are the real ones. None if an actor is missing.
+    pub fn target(self, agent: Agent, shift: Shift, quality: Quality, seed: u64) -> Option<Recipe> {
+        let parts = self.parts(quality, [0.4, 0.6])?;
+        // One lane: many would each cut an episode.
+        Some(Recipe { agent, shift, parts, rows: TARGET_ROWS, mean: false, lanes: 1, seed })
+    }
+
+    fn parts(self, quality: Quality, [medium, expert]: [f64; 2]) -> Option<Vec<Part>> {
+        let scaled = |parts: Vec<Part>, share: f64| {
+            let total: f64 = parts.iter().map(|p| p.weight).sum();
+            parts.into_iter().map(move |p| Part { weight: p.weight * share / total, ..p }).collect::<Vec<_>>()
+        };
+        let needed = match quality {
+            Quality::Medium => vec![scaled(self.medium, 1.0)],
+            Quality::Expert => vec![scaled(self.expert, 1.0)],
+            Quality::MediumReplay => vec![scaled(self.replay, 1.0)],
+            Quality::MediumExpert => vec![scaled(self.medium, medium), scaled(self.expert, expert)],
+        };
+        needed.iter().all(|p| !p.is_empty()).then(|| needed.concat())
+    }
 }
 
 /// Returns of some episodes.
@@ -224,7 +205,21 @@ pub struct Evaluation {
     pub score: Option<f64>,
 }
 
-/// Rolls `policy` out for `episodes` episodes by its mean action.
+impl Evaluation {
+    fn of(results: &[EpisodeResult], reference: Option<ReferenceScores>) -> Self {
+        let returns: Vec<f64> = results.iter().map(|r| r.episode_return).collect();
+        let mean_return = returns.iter().sum::<f64>() / returns.len() as f64;
+        let score = reference.map(|r| r.normalised_score(mean_return));
+        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score }
+    }
+
+    /// Mean of the episodes' lengths.
+    pub fn mean_length(&self) -> f64 {
+        self.lengths.iter().sum::<usize>() as f64 / self.lengths.len() as f64
+    }
+}
+
+/// Rolls `policy` out for `episodes` episodes, by its `mean` action or by sampled ones.
 pub fn evaluate(
     policy: &Policy,
     agent: Agent,
@@ -235,12 +230,20 @@ pub fn evaluate(
     reference: Option<ReferenceScores>,
 ) -> Result<Evaluation> {
     let actor = PolicyActor::new(policy.clone(), mean);
-    let results: Vec<EpisodeResult> = tce_sim::evaluate(agent, shift, &actor, episodes, streams)?;
-    let returns: Vec<f64> = results.iter().map(|r| r.episode_return).collect();
-    let mean_return = returns.iter().sum::<f64>() / returns.len() as f64;
-    Ok(Evaluation {
-        lengths: results.iter().map(|r| r.length).collect(),
-        returns,
-        score: reference.map(|r| r.normalised_score(mean_return)),
-    })
+    let results = tce_sim::evaluate(agent, shift, &actor, episodes, streams, interrupted)?;
+    Ok(Evaluation::of(&results, reference))
+}
+
+/// The same with sampled actions, and not to be interrupted.
+pub fn evaluate_to_the_end(
+    policy: &Policy,
+    agent: Agent,
+    shift: Shift,
+    episodes: usize,
+    streams: Streams,
+    reference: Option<ReferenceScores>,
+) -> Result<Evaluation> {
+    let actor = PolicyActor::new(policy.clone(), false);
+    let results = tce_sim::evaluate(agent, shift, &actor, episodes, streams, || false)?;
+    Ok(Evaluation::of(&results, reference))
 }

@@ -5,22 +5,29 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use tce_base::sha256_file;
 use tce_data::{
-    Agent, LoadOptions, Loaded, ReferenceScores, Shift, Transitions, ensure_same_agent, infer_agents, load,
+    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Transitions, ensure_same_agent,
+    infer_agents, load, reference_scores,
 };
+use tce_sim::EPISODE_LIMIT;
 
-use crate::actors::{shared_folder, stand_in};
+use crate::actors::{Cast, Recipe};
 use crate::error::{Error, Result};
+use crate::stand_ins::{self, shared_folder};
 use crate::task::Task;
+use crate::zoo;
 
 /// The files of a benchmark task, and where results go.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DataArgs {
-    /// Source data (default: collected from the actors found in TCE_SHARED).
+    /// Source data (default: collected from the zoo's actors, or from those in TCE_SHARED where the zoo lacks one).
     #[arg(long, value_name = "FILE")]
     pub source: Option<PathBuf>,
-    /// Target data (default: OTDF's file found in TCE_SHARED).
+    /// Target data (default: OTDF's public file if TCE_SHARED has it, otherwise collected from the zoo's actors).
     #[arg(long, value_name = "FILE")]
     pub target: Option<PathBuf>,
+    /// Do not look into TCE_SHARED: what is not given as a file is collected from the zoo.
+    #[arg(long)]
+    pub from_zoo: bool,
     /// Where results and finished stages are kept.
     #[arg(long, default_value = "runs")]
     pub out: PathBuf,
@@ -44,8 +51,41 @@ pub struct Inputs {
 pub struct Table {
     /// The rows.
     pub rows: Transitions,
+    /// The file.
+    pub file: PathBuf,
     /// SHA-256 of the file.
     pub hash: String,
+}
+
+/// What a data set is, and how good the policy was that collected it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Behaviour {
+    /// The file.
+    pub file: PathBuf,
+    /// Its rows.
+    pub rows: usize,
+    /// Whole episodes.
+    pub episodes: usize,
+    /// Their mean return.
+    pub mean: f64,
+    /// The spread of their returns.
+    pub std: f64,
+    /// The mean return, normalised in the domain that the rows come from.
+    pub score: Option<f64>,
+}
+
+impl Table {
+    fn behaviour(&self, reference: Option<ReferenceScores>) -> Behaviour {
+        let returns = tce_data::inspect(&self.rows, EPISODE_LIMIT).returns;
+        Behaviour {
+            file: self.file.clone(),
+            rows: self.rows.len(),
+            episodes: returns.count,
+            mean: returns.mean,
+            std: returns.std,
+            score: reference.map(|r| r.normalised_score(returns.mean)),
+        }
+    }
 }
 
 /// What identifies the inputs in a specification.
@@ -60,7 +100,7 @@ pub struct InputSpec {
 fn table(path: &Path, dims: Option<(usize, usize)>) -> Result<Table> {
     let Loaded { transitions, report, .. } = load(path, &LoadOptions { dims, ..LoadOptions::default() })?;
     eprintln!("{report}");
-    Ok(Table { rows: transitions, hash: sha256_file(path)? })
+    Ok(Table { rows: transitions, file: path.to_owned(), hash: sha256_file(path)? })
 }
 
 impl Inputs {
@@ -73,30 +113,36 @@ impl Inputs {
         Self { agent, shift: None, target, source }.checked()
     }
 
-    /// The data of a benchmark task: files where given; otherwise OTDF's file and `source_rows` rows collected from
-    /// stand-in actors, both from the shared folder. Collected rows are kept beside the results. Without `source_rows`
-    /// no source is looked at.
+    /// The data of a benchmark task: files where given; otherwise OTDF's public target file if the shared folder has it, and
+    /// what the zoo's actors (or those of the shared folder) collect: 5000 target rows, and source rows by D4RL's recipe of
+    /// which `source_rows` is the size of a medium set. Collected rows are kept beside the results. Without `source_rows` no
+    /// source is looked at.
     pub fn of_task(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<Self> {
-        let shared = shared_folder();
-        let target = args.target.clone().unwrap_or_else(|| task.target_file(&shared));
-        if !target.exists() {
-            return Err(Error::missing(
-                &target,
-                "no target data there; set TCE_SHARED to the folder that holds datasets/otdf, or give a file with --target",
-            ));
-        }
-        let dims = Some(task.agent.dims());
+        let Task { agent, shift, .. } = task;
+        let (shared, cache) = (shared_folder(), args.out.join("data"));
+        let collected =
+            |recipe: Recipe, quality: Quality| recipe.cached(&cache, &format!("{agent}-{}-{quality}", recipe.shift));
+        let public = task.target_file(&shared);
+        let target = match &args.target {
+            Some(path) => path.clone(),
+            None if !args.from_zoo && public.exists() => public,
+            None => match zoo::cast(agent, shift)?.target(agent, shift, task.target, 0) {
+                Some(recipe) => collected(recipe, task.target)?,
+                None => return Err(missing(shift, task.target, agent, "--target")),
+            },
+        };
+        let dims = Some(agent.dims());
         let target = table(&target, dims)?;
         let source: Option<PathBuf> = match (source_rows, &args.source) {
             (None, _) => None,
             (Some(_), Some(path)) => Some(path.clone()),
             (Some(rows), None) => {
-                let recipe = stand_in(task.agent, task.source, rows, 0, &shared)?;
-                Some(recipe.cached(&args.out.join("data"), &format!("{}-source-{}", task.agent, task.source))?)
+                let recipe = d4rl_recipe(agent, task.source, rows, 0, args.from_zoo)?;
+                Some(collected(recipe, task.source)?)
             }
         };
         let source = source.map(|s| table(&s, dims)).transpose()?;
-        Self { agent: Some(task.agent), shift: Some(task.shift), target, source }.checked()
+        Self { agent: Some(agent), shift: Some(shift), target, source }.checked()
     }
 
     fn checked(self) -> Result<Self> {
@@ -125,8 +171,37 @@ impl Inputs {
         source.ok_or_else(|| Error::Usage("this configuration needs source data; give a file with --source".into()))
     }
 
-    /// The returns that stand for 0 and 100 in the target domain.
-    pub fn reference(&self, table: tce_data::ScoreTable) -> Option<ReferenceScores> {
-        tce_data::reference_scores(self.agent?, self.shift?, table)
+    /// How good the policies were that collected the source and the target rows.
+    pub fn behaviour(&self, table: ScoreTable) -> (Option<Behaviour>, Behaviour) {
+        let of_source = self.agent.and_then(|agent| reference_scores(agent, Shift::Source, table));
+        let source = self.source.as_ref().map(|s| s.behaviour(of_source));
+        (source, self.target.behaviour(self.reference(table)))
     }
+
+    /// The returns that stand for 0 and 100 in the target domain.
+    pub fn reference(&self, table: ScoreTable) -> Option<ReferenceScores> {
+        reference_scores(self.agent?, self.shift?, table)
+    }
+}
+
+/// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo
+/// lacks, unless `from_zoo`.
+///
+/// # Errors
+/// If an actor is missing in both.
+pub fn d4rl_recipe(agent: Agent, quality: Quality, rows: usize, seed: u64, from_zoo: bool) -> Result<Recipe> {
+    let of = |cast: Cast| cast.source(agent, Shift::Source, quality, rows, seed);
+    let recipe = of(zoo::cast(agent, Shift::Source)?);
+    let recipe = recipe.or_else(|| if from_zoo { None } else { of(stand_ins::cast(agent, &shared_folder())) });
+    recipe.ok_or_else(|| missing(Shift::Source, quality, agent, "--source"))
+}
+
+fn missing(shift: Shift, quality: Quality, agent: Agent, option: &str) -> Error {
+    Error::missing(
+        &shared_folder(),
+        format!(
+            "no {quality} data of {agent}-{shift}: the zoo has no actors for it (tce zoo list), and neither has this folder; \
+             give a file with {option}, or set TCE_SHARED to the folder that holds datasets/otdf and policies"
+        ),
+    )
 }

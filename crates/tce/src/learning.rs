@@ -86,11 +86,11 @@ pub fn learn(
     let mut judged = vec![0; lanes.len()];
     let outcome = train_side_by_side(&mut lanes, steps, &label, device, |k, report, learner| {
         for (m, _) in seeds.iter().enumerate().skip(k * size).take(size) {
-            let figures = report.metrics.iter().map(|(&name, v)| (name, v[m - k * size]));
+            let figures = report.metrics.iter().map(|(name, v)| (name.as_str(), v[m - k * size]));
             metrics.log("learn", report.step, m, figures)?;
         }
-        for (&name, values) in &report.metrics {
-            let figures = learned.figures.entry(name.to_owned()).or_insert_with(|| vec![f64::NAN; seeds.len()]);
+        for (name, values) in &report.metrics {
+            let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![f64::NAN; seeds.len()]);
             figures[k * size..][..values.len()].copy_from_slice(values);
         }
         let number = report.step.checked_div(evaluation.every).unwrap_or(0);

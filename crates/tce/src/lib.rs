@@ -17,9 +17,11 @@ mod mixture;
 mod output;
 mod pipeline;
 mod stage;
+mod stand_ins;
 mod task;
 mod units;
 mod variant;
+mod zoo;
 
 pub use commands::Cli;
 pub use error::{Error, Result};

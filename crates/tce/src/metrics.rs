@@ -33,6 +33,30 @@ impl Metrics {
         Ok(Self { path, lines: BufWriter::new(file), events_root, events: Vec::new() })
     }
 
+    /// Goes on with what is in `directory`, cut back to the first `step` steps: a killed program may have written more than its
+    /// checkpoint knows.
+    pub fn resume(directory: &Path, step: u64) -> Result<Self, FileError> {
+        let path = directory.join("metrics.jsonl");
+        let old = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
+            Err(e) => return Err(FileError::new(&path, "read", e)),
+        };
+        let mut metrics = Self::start(directory)?;
+        // The last line may be half written.
+        for line in old.lines().filter_map(|line| serde_json::from_str::<Map<String, Value>>(line).ok()) {
+            let number = |name: &str| line.get(name).and_then(Value::as_u64);
+            let (Some(at), Some(member)) = (number("step"), number("member")) else { continue };
+            let stage = line.get("stage").and_then(Value::as_str).unwrap_or_default();
+            let figures = line.iter().filter(|(name, _)| !matches!(name.as_str(), "step" | "member" | "stage"));
+            let figures = figures.map(|(name, value)| (name.as_str(), value.as_f64().unwrap_or(f64::NAN)));
+            if at <= step {
+                metrics.log(stage, at, member as usize, figures)?;
+            }
+        }
+        Ok(metrics)
+    }
+
     /// Records `values` of `member` of the population after `step` steps of `stage`.
     pub fn log<'a>(
         &mut self,

@@ -36,8 +36,8 @@ pub enum Variant {
 }
 
 impl Variant {
-    /// The three floors that stand beside every result.
-    pub const FLOORS: [Variant; 3] = [Variant::Bc, Variant::BcTop, Variant::TargetOnly];
+    /// The floors that stand beside every result.
+    pub const FLOORS: [Variant; 4] = [Variant::BcRaw, Variant::Bc, Variant::BcTop, Variant::TargetOnly];
 
     /// The name on the command line and in files.
     pub fn name(self) -> String {

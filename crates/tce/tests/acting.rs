@@ -71,3 +71,41 @@ fn another_training_in_the_same_place_and_a_damaged_checkpoint_are_refused() {
     assert_eq!(damaged.status.code(), Some(1));
     assert!(message(&damaged).contains("not what the ledger says"), "{}", message(&damaged));
 }
+
+#[test]
+fn a_training_can_begin_with_the_networks_of_another() {
+    let dir = tempfile::tempdir().unwrap();
+    let train = |out: &str, env: &str, start: &str, more: &[&str]| {
+        let args = ["train-sac", env, "--steps", "150", "--out", out, "--steps-per-update", "2", "--batch", "32"];
+        let rest = ["--start", start, "--evaluate-every", "100", "--episodes", "2", "--checkpoint-every", "60"];
+        tce(dir.path(), &[&args[..], &rest, more].concat())
+    };
+    let learner = |place: &str| {
+        let mut files = fs::read_dir(dir.path().join(place)).unwrap().map(|e| e.unwrap().path());
+        fs::read(files.find(|p| p.to_string_lossy().contains("learner-")).unwrap()).unwrap()
+    };
+    let from = ["--from", "first/hopper-source-seed0"];
+    assert!(train("first", "hopper", "60", &[]).status.success());
+    // No update comes before step 1000: what it ends with is what it began with.
+    assert!(train("second", "hopper-morph", "1000", &from).status.success());
+    assert!(train("new", "hopper-morph", "1000", &[]).status.success());
+    let first = learner("first/hopper-source-seed0");
+    assert!(first == learner("second/hopper-morph-seed0"));
+    assert!(first != learner("new/hopper-morph-seed0"));
+    let settings = fs::read_to_string(dir.path().join("second/hopper-morph-seed0/settings.json")).unwrap();
+    assert!(settings.contains("hopper-source seed 0, step 1"), "{settings}");
+    // Its first actions are the policy's, not the random ones of new networks.
+    let first_action = |place: &str| {
+        let mut files = fs::read_dir(dir.path().join(place)).unwrap().map(|e| e.unwrap().path());
+        let replay = files.find(|p| p.to_string_lossy().contains("replay-")).unwrap();
+        load(&replay, &LoadOptions::default()).unwrap().transitions.actions[..3].to_vec()
+    };
+    assert_ne!(first_action("second/hopper-morph-seed0"), first_action("new/hopper-morph-seed0"));
+
+    let refused = train("third", "walker2d", "60", &from);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(message(&refused).contains("cannot drive another"), "{}", message(&refused));
+    let nothing = train("third", "hopper", "60", &["--from", "nowhere"]);
+    assert_eq!(nothing.status.code(), Some(2));
+    assert!(message(&nothing).contains("no checkpoint of a training here"), "{}", message(&nothing));
+}

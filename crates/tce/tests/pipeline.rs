@@ -40,7 +40,7 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
     let (first, again, two) = (run("one", "1"), run("again", "1"), run("two", "2"));
     let scores =
         |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
-    assert_eq!(scores(&first).len(), 5, "three floors and two variants");
+    assert_eq!(scores(&first).len(), 6, "four floors and two variants");
     assert_eq!(scores(&first), scores(&again));
     assert_eq!(scores(&first), scores(&two));
     let [a, b, c] = ["one", "again", "two"].map(|o| results(&dir.path().join(o)));

@@ -7,10 +7,12 @@ use serde::Serialize;
 use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, reference_scores, save_d4rl};
 use tce_sim::EPISODE_LIMIT;
 
-use crate::actors::{Part, Recipe, shared_folder, stand_in};
+use crate::actors::{Part, Recipe};
 use crate::error::{Error, Result};
+use crate::inputs::d4rl_recipe;
 use crate::output::{Output, table};
 use crate::task::parse_environment;
+use crate::zoo;
 
 /// Arguments of `collect`.
 #[derive(Debug, Args)]
@@ -18,10 +20,10 @@ pub struct Collect {
     /// The environment: hopper (source), hopper-morph, ant-gravity, ...
     #[arg(long, value_parser = parse_environment)]
     env: (Agent, Shift),
-    /// A policy (.safetensors or .npz), with its share of the rows behind a colon in mixtures: a.npz:0.3. May be repeated.
+    /// A policy (.safetensors, .npz, or zoo:NAME), with its share of the rows behind a colon in mixtures: a.npz:0.3. May be repeated.
     #[arg(long = "actor", value_name = "FILE[:WEIGHT]", required_unless_present = "quality")]
     actors: Vec<String>,
-    /// Instead of actors: the stand-ins under TCE_SHARED for D4RL's data of this quality (source domain only).
+    /// Instead of actors: those of the zoo for data of this quality (or stand-ins under TCE_SHARED where it has none).
     #[arg(long, conflicts_with = "actors")]
     quality: Option<Quality>,
     /// Transitions to collect.
@@ -63,14 +65,17 @@ impl Collect {
         }
         let (agent, shift) = self.env;
         let recipe = match self.quality {
-            Some(_) if shift != Shift::Source => {
-                return Err(Error::Usage(
-                    "--quality names source-domain data; give --actor for a changed robot".into(),
-                ));
-            }
             Some(quality) => {
-                let stand_in = stand_in(agent, quality, self.rows, self.seed, &shared_folder())?;
-                Recipe { rows: self.rows, mean: self.mean, lanes: self.lanes, ..stand_in }
+                let recipe = if shift == Shift::Source {
+                    d4rl_recipe(agent, quality, self.rows, self.seed, false)?
+                } else {
+                    let recipe = zoo::cast(agent, shift)?.source(agent, shift, quality, self.rows, self.seed);
+                    recipe.ok_or_else(|| {
+                        let message = "the zoo has no actors for this quality there; name some with --actor";
+                        Error::Usage(format!("{agent}-{shift}: {message}"))
+                    })?
+                };
+                Recipe { rows: self.rows, mean: self.mean, lanes: self.lanes, ..recipe }
             }
             None => {
                 let parts = self.actors.iter().map(|a| part(a)).collect::<Result<_>>()?;

@@ -133,7 +133,7 @@ impl GeneratorArgs {
         let inputs = Inputs::of_task(self.task, &self.data, Some(config.source.rows))?;
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
-        let inputs = Inputs { target: Table { rows: training, hash }, ..inputs };
+        let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };
         let training = &inputs.target.rows;
         let device = cpu();
         let seeds = [self.seed];

@@ -15,7 +15,7 @@ use crate::task::parse_environment;
 /// Arguments of `evaluate`.
 #[derive(Debug, Args)]
 pub struct Evaluate {
-    /// Policies (.safetensors or .npz).
+    /// Policies (.safetensors, .npz, or zoo:NAME; see tce zoo list).
     #[arg(required = true)]
     policies: Vec<PathBuf>,
     /// The environment: hopper (source), hopper-morph, ant-gravity, ...
@@ -58,12 +58,11 @@ impl Evaluate {
         output.print(&all, |all| {
             let rows = all.iter().map(|e| {
                 let (mean, std) = mean_std(&e.evaluation.returns);
-                let lengths: Vec<f64> = e.evaluation.lengths.iter().map(|&l| l as f64).collect();
                 [
                     e.policy.display().to_string(),
                     e.evaluation.returns.len().to_string(),
                     format!("{mean:.1} ± {std:.1}"),
-                    format!("{:.0}", mean_std(&lengths).0),
+                    format!("{:.0}", e.evaluation.mean_length()),
                     e.evaluation.score.map_or("-".into(), |s| format!("{s:.1}")),
                 ]
             });

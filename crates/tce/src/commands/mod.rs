@@ -17,6 +17,7 @@ mod evaluate;
 mod learn;
 mod run;
 mod train_sac;
+mod zoo;
 
 /// Cross-domain offline reinforcement learning: a policy for a changed robot from many transitions of the old one and
 /// few of the new one.
@@ -45,6 +46,9 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Train agents by soft actor-critic in the simulator: actors for data of any quality.
     TrainSac(train_sac::TrainSac),
+    /// The actors that come with the program.
+    #[command(subcommand)]
+    Zoo(zoo::Zoo),
     /// Roll trained actors out into a data set.
     Collect(collect::Collect),
     /// Look at, check and convert data sets.
@@ -77,6 +81,7 @@ impl Cli {
             Command::Learn(args) => args.run(output),
             Command::Evaluate(args) => args.run(output),
             Command::TrainSac(args) => args.run(output),
+            Command::Zoo(command) => command.run(output),
             Command::Collect(args) => args.run(output),
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),

@@ -5,7 +5,7 @@ use serde::Serialize;
 use tce_nn::cpu;
 
 use crate::error::Result;
-use crate::inputs::{DataArgs, Inputs};
+use crate::inputs::{Behaviour, DataArgs, Inputs};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
@@ -28,7 +28,8 @@ pub struct Run {
     seed: u64,
     #[command(flatten)]
     data: DataArgs,
-    /// Leave out the floors (cloning, cloning of the best half, IQL on the target alone).
+    /// Leave out the floors (cloning with raw and with standardised observations, cloning of the best half, IQL on the target
+    /// alone).
     #[arg(long)]
     no_floors: bool,
     #[command(flatten)]
@@ -38,6 +39,8 @@ pub struct Run {
 #[derive(Serialize)]
 struct Report {
     task: Task,
+    source: Option<Behaviour>,
+    target: Behaviour,
     rows: Vec<Row>,
 }
 
@@ -73,7 +76,8 @@ impl Run {
             let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, &cpu())?;
             rows.push(Row { title: variant.title().into(), variant, floor, summary });
         }
-        output.print(&Report { task: self.task, rows }, render);
+        let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
+        output.print(&Report { task: self.task, source, target, rows }, render);
         Ok(())
     }
 }
@@ -95,7 +99,16 @@ fn render(report: &Report) -> String {
             r.summary.extra_rows.to_string(),
             format!("{:.0} s", r.summary.seconds),
         ]
+        .to_vec()
     });
+    let behaviour = |title: &str, b: &Behaviour| {
+        let score = b.score.map_or("-".into(), |s| format!("{s:.1}"));
+        let figures = [score, format!("{:.1} ± {:.1}", b.mean, b.std), "-".into(), b.rows.to_string(), "-".into()];
+        std::iter::once(title.to_owned()).chain(figures).collect::<Vec<_>>()
+    };
+    let lines = lines
+        .chain(report.source.iter().map(|b| behaviour("source behaviour", b)))
+        .chain([behaviour("target behaviour", &report.target)]);
     let header = ["method", "score", "return", "seeds", "other rows", "time"];
     let mut text = format!("{}\n{}\n", report.task, table(&header, lines));
     let generated = report.rows.iter().filter(|r| !r.summary.generated.is_empty()).map(|r| {
@@ -121,6 +134,9 @@ fn render(report: &Report) -> String {
     }
     for row in &report.rows {
         text += &format!("{}: {}\n", row.title, row.summary.directory.display());
+    }
+    for (name, b) in report.source.iter().map(|b| ("source", b)).chain([("target", &report.target)]) {
+        text += &format!("{name} rows: {}\n", b.file.display());
     }
     text
 }

@@ -41,9 +41,18 @@ pub struct TrainSac {
     /// Directory of the trainings, one below it for each.
     #[arg(long, default_value = "runs/sac")]
     out: PathBuf,
-    /// Uniformly random actions before the first update.
+    /// Begin with the networks of the training in this directory, in another domain of the same robot.
+    #[arg(long)]
+    from: Option<PathBuf>,
+    /// Steps before the first update: uniformly random, or the policy's of --from.
     #[arg(long, default_value_t = 10_000)]
     start: u64,
+    /// Environment steps per update.
+    #[arg(long, default_value_t = 1)]
+    steps_per_update: u64,
+    /// Rows per update.
+    #[arg(long, default_value_t = 256)]
+    batch: usize,
     /// Steps between evaluations.
     #[arg(long, default_value_t = 10_000)]
     evaluate_every: u64,
@@ -71,8 +80,10 @@ struct Row {
 impl TrainSac {
     /// Runs the command.
     pub fn run(self, output: Output) -> Result<()> {
-        if self.seeds == 0 || self.episodes == 0 || self.evaluate_every == 0 || self.start == 0 {
-            let message = "--seeds, --episodes, --evaluate-every and --start must be at least 1";
+        let counts = [self.seeds, self.episodes as u64, self.evaluate_every, self.start, self.steps_per_update];
+        if counts.contains(&0) || self.batch == 0 {
+            let message =
+                "--seeds, --episodes, --evaluate-every, --start, --steps-per-update and --batch must be at least 1";
             return Err(Error::Usage(message.into()));
         }
         let goal = Goal {
@@ -82,6 +93,11 @@ impl TrainSac {
             checkpoint_every: self.checkpoint_every,
         };
         let mut trainings = Vec::new();
+        for (k, environment) in self.environments.iter().enumerate() {
+            if self.environments[..k].contains(environment) {
+                return Err(Error::Usage(format!("{}-{} is named twice", environment.0, environment.1)));
+            }
+        }
         for &(agent, shift) in &self.environments {
             for seed in self.seed..self.seed + self.seeds {
                 let settings = Settings {
@@ -89,20 +105,28 @@ impl TrainSac {
                     shift,
                     seed,
                     start: self.start,
-                    batch: 256,
+                    steps_per_update: self.steps_per_update,
+                    batch: self.batch,
+                    from: None,
                     evaluate_every: self.evaluate_every,
                     episodes: self.episodes,
                     sac: SacConfig::default(),
                 };
                 let directory = self.out.join(format!("{agent}-{shift}-seed{seed}"));
-                let training = Training::open(&directory, settings, goal.clone(), &cpu())?;
+                let training = Training::open(&directory, settings, self.from.as_deref(), goal.clone(), &cpu())?;
                 trainings.push((format!("{agent}-{shift}"), seed, directory, training));
             }
         }
+        let mut faults: Vec<Option<Error>> = trainings.iter().map(|_| None).collect();
         let started = std::time::Instant::now();
         let before: Vec<u64> = trainings.iter().map(|t| t.3.ledger().step).collect();
-        while trainings.iter().any(|t| !t.3.finished()) {
-            trainings.par_iter_mut().try_for_each(|t| t.3.advance(TURN))?;
+        // A training that fails does not take the others with it.
+        while trainings.iter().zip(&faults).any(|(t, fault)| fault.is_none() && !t.3.finished()) {
+            trainings.par_iter_mut().zip(&mut faults).for_each(|(t, fault)| {
+                if fault.is_none() {
+                    *fault = t.3.advance(TURN).err();
+                }
+            });
         }
         let seconds = started.elapsed().as_secs_f64();
         let mut rows = Vec::new();
@@ -124,7 +148,7 @@ impl TrainSac {
                     format!("{} seed {}", r.environment, r.seed),
                     r.ledger.step.to_string(),
                     last.map_or("-".into(), |e| format!("{:.0} ± {:.0}", e.mean, e.std)),
-                    last.map_or("-".into(), |e| format!("{:.1}", e.score)),
+                    last.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
                     r.ledger.snapshots.len().to_string(),
                     format!("{:.0}", r.steps_per_second),
                     r.directory.display().to_string(),
@@ -132,6 +156,15 @@ impl TrainSac {
             });
             table(&["training", "steps", "return", "score", "snapshots", "steps/s", "directory"], lines)
         });
-        Ok(())
+        let mut faults = rows.iter().zip(faults).filter_map(|(row, fault)| Some((row, fault?)));
+        match (faults.next(), faults.next()) {
+            (None, _) => Ok(()),
+            (Some((_, fault)), None) => Err(fault),
+            (Some(one), Some(two)) => {
+                let all = [one, two].into_iter().chain(faults);
+                let lines = all.map(|(row, fault)| format!("{} seed {}: {fault}", row.environment, row.seed));
+                Err(Error::Failed(lines.collect::<Vec<_>>().join("\n")))
+            }
+        }
     }
 }
