@@ -18,6 +18,7 @@ VENV = os.path.join(ROOT, "target", "peers", "venv")
 PYTHON = os.path.join(VENV, "bin", "python")
 PEERS = {
     "iql": ["torch eager", "torch compile", "torch whole", "jax jit"],
+    "sac": ["torch eager", "torch compile"],
     "score-train": ["torch eager", "torch compile", "jax jit"],
     "score-eval-1k": ["torch eager", "torch compile", "torch hoisted", "torch hoisted-compile", "jax jit"],
     "score-eval-4k": ["torch eager", "torch compile", "torch hoisted", "torch hoisted-compile", "jax jit"],

@@ -1,4 +1,4 @@
-"""PyTorch's side: torch_peer.py WORKLOAD VARIANT, with WORKLOAD iql | score-train | score-eval-N and VARIANT eager | compile
+"""PyTorch's side: torch_peer.py WORKLOAD VARIANT, with WORKLOAD iql | sac | score-train | score-eval-N and VARIANT eager | compile
 (what people run) | whole (iql: the whole step with twins as one batched product, gradients and Adam in one compiled graph) |
 hoisted, hoisted-compile (score-eval: label and time passed through their layers beforehand, as a sampler may)."""
 import copy
@@ -72,6 +72,60 @@ class Iql:
         adam.zero_grad(set_to_none=True)
         loss.backward()
         adam.step()
+
+
+class Sac:
+    """As the field's single-file implementations write it: twins apart, automatic temperature, one policy update per update."""
+
+    def __init__(self, compiled):
+        self.pi = mlp(c.OBS, c.WIDTH, c.WIDTH, 2 * c.ACT)
+        self.q1, self.q2 = (mlp(c.OBS + c.ACT, c.WIDTH, c.WIDTH, 1) for _ in range(2))
+        self.t1, self.t2 = copy.deepcopy(self.q1), copy.deepcopy(self.q2)
+        self.log_alpha = torch.zeros(1, requires_grad=True)
+        adam = lambda parameters: torch.optim.Adam(parameters, lr=c.LR, fused=compiled or None)  # noqa: E731
+        self.q_adam = adam([*self.q1.parameters(), *self.q2.parameters()])
+        self.pi_adam, self.alpha_adam = adam(self.pi.parameters()), adam([self.log_alpha])
+        self.table = table()
+        wrap = torch.compile if compiled else (lambda f: f)
+        self.q_loss, self.pi_loss = wrap(self._q_loss), wrap(self._pi_loss)
+
+    def sample(self, s):
+        mean, log_std = self.pi(s).chunk(2, -1)
+        log_std = log_std.clamp(-20, 2)
+        noise = torch.randn_like(mean)
+        u = mean + log_std.exp() * noise
+        normal = -0.5 * noise**2 - log_std - 0.9189385332046727
+        return torch.tanh(u), (normal - 2 * (0.6931471805599453 - u - F.softplus(-2 * u))).sum(1, keepdim=True)
+
+    def _q_loss(self, s, a, r, s2, alive, alpha):
+        with torch.no_grad():
+            a2, log_prob = self.sample(s2)
+            sa2 = torch.cat([s2, a2], 1)
+            y = r + alive * c.GAMMA * (torch.min(self.t1(sa2), self.t2(sa2)) - alpha * log_prob)
+        sa = torch.cat([s, a], 1)
+        return F.mse_loss(self.q1(sa), y) + F.mse_loss(self.q2(sa), y)
+
+    def _pi_loss(self, s, alpha):
+        a, log_prob = self.sample(s)
+        sa = torch.cat([s, a], 1)
+        return (alpha * log_prob - torch.min(self.q1(sa), self.q2(sa))).mean(), log_prob.detach()
+
+    def step(self):
+        rows = torch.randint(0, c.ROWS, (c.BATCH,))
+        s, a, r, s2, alive = (x[rows] for x in self.table)
+        alpha = self.log_alpha.detach().exp()
+        Iql.descend(self.q_adam, self.q_loss(s, a, r, s2, alive, alpha))
+        for q in (self.q1, self.q2):
+            q.requires_grad_(False)
+        loss, log_prob = self.pi_loss(s, alpha)
+        Iql.descend(self.pi_adam, loss)
+        for q in (self.q1, self.q2):
+            q.requires_grad_(True)
+        Iql.descend(self.alpha_adam, -(self.log_alpha * (log_prob - c.ACT).mean()).sum())
+        with torch.no_grad():
+            for q, t in ((self.q1, self.t1), (self.q2, self.t2)):
+                for p, tp in zip(q.parameters(), t.parameters()):
+                    tp.lerp_(p, c.POLYAK)
 
 
 class WholeIql:
@@ -202,7 +256,9 @@ def score_eval(rows, variant):
 
 def main(workload, variant):
     compiled = "compile" in variant
-    if workload == "iql":
+    if workload == "sac":
+        c.serve(Sac(compiled).step, warm_up=20)
+    elif workload == "iql":
         c.serve((WholeIql() if variant == "whole" else Iql(compiled)).step, warm_up=20)
     elif workload == "score-train":
         c.serve(score_train(compiled), warm_up=20)

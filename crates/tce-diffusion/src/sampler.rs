@@ -8,7 +8,7 @@
 //! | `dpm-solver` | `steps` N (20) | N | DPM-Solver++(2M), Lu et al. 2022, Alg. 2 |
 //! | `sde-dpm-solver` | `steps` N (20) | N | SDE-DPM-Solver++(2M), the same, Section 3.4 |
 //!
-//! The stochastic ones walk [`Process::uniform_grid`], the deterministic ones [`Process::ratio_grid`], each with the
+//! Predictor-corrector and Euler–Maruyama walk [`Process::uniform_grid`], the others [`Process::ratio_grid`], each with the
 //! spacing that costs it least. What 20 steps of EDM (σ_max 20) with an exact denoiser add to a standard deviation of 1
 //! and of .05: Heun 1.9 and 4.9 % on `Karras`, 3.2 and 3.3 % on `Log`; DPM-Solver++(2M) 2.1 and 4.7 %, 1.2 and 1.2 %.
 

@@ -1,6 +1,8 @@
 //! Training by denoising score matching (B.2, B.6): Adam on ‖F − target‖², one set of tensors for the whole population.
 
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
@@ -91,6 +93,8 @@ pub struct Trainer {
     network: Trained<ScoreNetwork>,
     average: Option<Averaged<ScoreNetwork>>,
     step: u64,
+    /// Raised by whichever of several trainings diverges.
+    stop: Arc<AtomicBool>,
 }
 
 impl Trainer {
@@ -117,7 +121,12 @@ impl Trainer {
         let network = spec.init(members, name, &device);
         let average = (config.ema > 0.0).then(|| Averaged::new(&network));
         let (name, members, network) = (name.to_owned(), members.to_vec(), Trained::new(network));
-        Ok(Self { name, spec, process, config, members, device, network, average, step: 0 })
+        Ok(Self { name, spec, process, config, members, device, network, average, step: 0, stop: Arc::default() })
+    }
+
+    /// Several trainings that are of use only together share a flag: when one diverges, the others stop too.
+    pub fn stop_with(&mut self, other: &Trainer) {
+        self.stop = other.stop.clone();
     }
 
     /// Steps taken.
@@ -143,7 +152,7 @@ impl Trainer {
         let progress = Progress::new(format!("train {}", self.name), steps.saturating_sub(self.step), "steps");
         let (mut sum, mut count) = (None, 0u64);
         while self.step < steps {
-            if interrupted() {
+            if interrupted() || self.stop.load(Ordering::Relaxed) {
                 let label = format!("training of {}", self.name);
                 return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
             }
@@ -161,6 +170,7 @@ impl Trainer {
                 if let Some(member) = losses.iter().position(|l| !l.is_finite()) {
                     let (label, loss) = (format!("training of {}", self.name), losses[member]);
                     let (step, learning_rate) = (self.step, self.config.learning_rate);
+                    self.stop.store(true, Ordering::Relaxed);
                     return Err(DiffusionError::Diverged { label, member, loss, step, learning_rate });
                 }
                 progress.message(format!("loss {:.4}", losses.iter().sum::<f32>() / losses.len() as f32));

@@ -122,7 +122,7 @@ impl PolicyOutput {
     /// # Panics
     /// If the form is not [`PolicyForm::TanhGaussian`].
     pub fn sample(&self, members: &[Streams], step: u64) -> Tensor<3> {
-        self.draw(members, "policy noise", step).1
+        self.draw(members, "policy noise", step).action
     }
 
     /// A sample ã = tanh(u), u = μ + σ n, and its log density Σ_d ln N(u_d; μ_d, σ_d²) - ln(1 - tanh² u_d), `[P, B, 1]`;
@@ -131,22 +131,31 @@ impl PolicyOutput {
     /// # Panics
     /// If the form is not [`PolicyForm::TanhGaussian`].
     pub fn sample_with_log_prob(&self, members: &[Streams], name: &str, step: u64) -> (Tensor<3>, Tensor<3>) {
-        let (u, action) = self.draw(members, name, step);
-        let (mean, log_std) = self.pre_tanh.clone().expect("as above");
+        let Draw { noise, u, action, log_std } = self.draw(members, name, step);
         // ln(1 - tanh² u) = 2 (ln 2 - |u| - ln(1 + e^(-2|u|))): no logarithm of a vanishing number.
-        let magnitude = u.clone().abs();
+        let magnitude = u.abs();
         let softplus = (magnitude.clone() * -2.0).exp().log1p();
         let squash = ((magnitude + softplus).neg() + std::f64::consts::LN_2) * 2.0;
-        (action, normal_log_prob(u, mean, log_std) - squash.sum_dim(2))
+        // (u - μ) / σ is the n that was drawn; from u it comes back with rounding errors that a small σ blows up.
+        let normal = (noise.powi_scalar(2) * -0.5 - log_std - 0.5 * std::f64::consts::TAU.ln()) - squash;
+        (action, normal.sum_dim(2))
     }
 
-    /// (u, tanh u).
-    fn draw(&self, members: &[Streams], name: &str, step: u64) -> (Tensor<3>, Tensor<3>) {
+    fn draw(&self, members: &[Streams], name: &str, step: u64) -> Draw {
         let (mean, log_std) = self.pre_tanh.as_ref().expect("only a tanh-Gaussian policy is sampled in training");
         let noise = member_noise(members, name, step, mean.dims(), &mean.device().inner());
-        let u = mean.clone() + log_std.clone().exp() * noise;
-        (u.clone(), u.tanh())
+        let log_std = log_std.clone();
+        let u = mean.clone() + log_std.clone().exp() * noise.clone();
+        Draw { noise, action: u.clone().tanh(), u, log_std }
     }
+}
+
+/// n, u = μ + σ n, tanh u and ln σ, each `[P, B, A]`.
+struct Draw {
+    noise: Tensor<3>,
+    u: Tensor<3>,
+    action: Tensor<3>,
+    log_std: Tensor<3>,
 }
 
 /// The policies of a population and their optimiser.

@@ -40,6 +40,8 @@ pub struct Buffer {
     batch: usize,
     inputs: Vec<usize>,
     act_dim: usize,
+    /// The stream of batches.
+    stream: &'static str,
 }
 
 /// The row a batch entry came from.
@@ -112,7 +114,12 @@ impl Buffer {
         // A dimension that is constant in the data of every member only costs time (Ant's 84 contact slots).
         let live = |d: &usize| members.iter().any(|m| !m.standardizer.dead.contains(d));
         let inputs = (0..dims.0).filter(live).collect();
-        Ok(Self { members, batch, inputs, act_dim: dims.1 })
+        Ok(Self { members, batch, inputs, act_dim: dims.1, stream: "batch" })
+    }
+
+    /// The same with batches from another stream: two learners of one seed must not draw the same rows at every step.
+    pub fn with_stream(self, stream: &'static str) -> Self {
+        Self { stream, ..self }
     }
 
     /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent that acts. Observations
@@ -122,7 +129,7 @@ impl Buffer {
         let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
         let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
         let member = Member { streams, parts, standardizer, reward_scale: 1.0 };
-        Self { members: vec![member], batch, inputs, act_dim: dims.1 }
+        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream: "batch" }
     }
 
     /// The table of a replay buffer, to add rows to.
@@ -177,7 +184,7 @@ impl Buffer {
         let mut picks = Vec::with_capacity(p * b);
         let mut target_rows = b;
         for member in &self.members {
-            let mut rng = member.streams.indexed("batch", step);
+            let mut rng = member.streams.indexed(self.stream, step);
             let split = split(b, &member.parts);
             target_rows = target_rows.min(split[0]);
             for (k, (part, &rows)) in member.parts.iter().zip(&split).enumerate() {

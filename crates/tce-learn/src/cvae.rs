@@ -163,7 +163,7 @@ impl Learner for CvaeLearner {
 /// # Errors
 /// If the configuration cannot be used.
 pub fn train_cvae(buffer: &Buffer, config: &CvaeConfig, device: &Device) -> Result<Option<Cvae>, LearnError> {
-    let target = buffer.target_only(config.batch)?;
+    let target = buffer.target_only(config.batch)?.with_stream("cvae batch");
     let mut learner = CvaeLearner::new(&target, config, device)?;
     let steps = Steps::new(config.steps, 0);
     let outcome = train(&mut learner, &target, steps, "behaviour CVAE", device, |_, _| Ok::<_, LearnError>(()))?;

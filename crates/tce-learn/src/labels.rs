@@ -125,7 +125,7 @@ impl LabelModels {
                 reward_scale: 1.0,
             });
         }
-        let buffer = Buffer::new(training, config.batch)?;
+        let buffer = Buffer::new(training, config.batch)?.with_stream("label batch");
         let model = |target| PairModel::new(target, &buffer, &config.model, config.steps, device);
         Ok(Self {
             action: model(PairTarget::Action)?,

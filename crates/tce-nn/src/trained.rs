@@ -70,8 +70,8 @@ impl<M: Module> Trained<M> {
         let key = format!("adam.{name}");
         let found = state.metadata.get(&key).cloned().unwrap_or_else(|| "nothing".into());
         let time = found.parse().map_err(|_| missing(key.clone(), found))?;
-        let net = self.net.take().expect("only empty during a step");
-        let net = self.net.insert(state.apply(name, net, path)?);
+        // A file that does not fit leaves the network as it was.
+        let net = state.apply(name, self.net().clone(), path)?;
         let device = net.devices()[0].clone().inner();
         let moment = |part: &str, k: usize| -> Option<Tensor<1>> {
             let (shape, data) = state.tensors.get(&format!("{key}.{part}.{k}"))?;
@@ -85,6 +85,7 @@ impl<M: Module> Trained<M> {
         if time > 0 && moments.len() != parameters {
             return Err(missing(key, format!("the moments of {} of {parameters} parameters", moments.len())));
         }
+        self.net = Some(net);
         self.adam.restore(time, moments);
         Ok(())
     }

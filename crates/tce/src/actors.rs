@@ -175,6 +175,8 @@ impl Cast {
     /// three of expert, and its successors are the real ones. None if an actor is missing.
     pub fn target(self, agent: Agent, shift: Shift, quality: Quality, seed: u64) -> Option<Recipe> {
         let parts = self.parts(quality, [0.4, 0.6])?;
+        // Another seed than the source's, or both sets would begin with the same noise.
+        let seed = seed ^ u64::from_le_bytes(*b"target\0\0");
         // One lane: many would each cut an episode.
         Some(Recipe { agent, shift, parts, rows: TARGET_ROWS, mean: false, lanes: 1, seed })
     }
@@ -203,6 +205,9 @@ pub struct Evaluation {
     pub lengths: Vec<usize>,
     /// 100 (J - J_r) / (J_e - J_r) of the mean return, where references are known.
     pub score: Option<f64>,
+    /// Why there are no episodes, if there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failed: Option<String>,
 }
 
 impl Evaluation {
@@ -210,7 +215,12 @@ impl Evaluation {
         let returns: Vec<f64> = results.iter().map(|r| r.episode_return).collect();
         let mean_return = returns.iter().sum::<f64>() / returns.len() as f64;
         let score = reference.map(|r| r.normalised_score(mean_return));
-        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score }
+        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score, failed: None }
+    }
+
+    /// That of a policy that cannot act, and why.
+    pub fn failed(why: String) -> Self {
+        Self { returns: Vec::new(), lengths: Vec::new(), score: None, failed: Some(why) }
     }
 
     /// Mean of the episodes' lengths.

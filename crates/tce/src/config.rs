@@ -186,6 +186,15 @@ impl Config {
         ] {
             within(key, value as f64, 1.0, 1e12)?;
         }
+        if self.mixture.generated && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
+            return Err(Error::Usage(
+                "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \
+                 a number of rows, a smaller lambda, or mixture.generated = false"
+                    .into(),
+            ));
+        }
+        self.generator.process.check().map_err(|e| Error::Usage(format!("generator.process: {e}")))?;
+        self.generator.sampler.check().map_err(|e| Error::Usage(format!("generator.sampler: {e}")))?;
         self.learner.iql.check().map_err(|e| Error::Usage(format!("learner.iql: {e}")))
     }
 

@@ -10,13 +10,13 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams};
 use tce_data::Transitions;
 use tce_diffusion::{
-    Condition, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target, TrainConfig, Trainer,
+    Condition, DiffusionError, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target, TrainConfig, Trainer,
     uniform_labels,
 };
 use tce_nn::Device;
 
 use crate::config::GeneratorConfig;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::metrics::Metrics;
 use crate::stage::Stage;
@@ -138,6 +138,7 @@ impl Generator {
         let transition_data = ScoreData::conditioned(&outputs, d, &target_states, d)?;
         let mut state = Trainer::new("state", NetworkConfig::new(d, 1), g.process, train, &members, device)?;
         let mut transition = Trainer::new("transition", NetworkConfig::new(d, d), g.process, train, &members, device)?;
+        transition.stop_with(&state);
         let metrics = Mutex::new(metrics);
         let mut state_run = || run(&mut state, &state_data, g.state_steps, &metrics, "state");
         let mut transition_run = || run(&mut transition, &transition_data, g.transition_steps, &metrics, "transition");
@@ -150,7 +151,13 @@ impl Generator {
         } else {
             (state_run(), transition_run())
         };
-        let (state_loss, transition_loss) = (state_loss?, transition_loss?);
+        let (state_loss, transition_loss) = match (state_loss, transition_loss) {
+            // The one that diverged is the reason, not the one that was stopped for it.
+            (Err(Error::Diffusion(DiffusionError::Interrupted { .. })), Err(reason)) | (Err(reason), _) => {
+                return Err(reason);
+            }
+            (Ok(state), transition) => (state, transition?),
+        };
         let trained = Trained { units: units.clone(), state_loss, transition_loss, seconds: 0.0 };
         Ok((Self { units, state: state.model(), transition: transition.model() }, trained))
     }

@@ -12,6 +12,7 @@ use tce_learn::{
     return_range_scale, train_side_by_side,
 };
 use tce_nn::{Device, is_cpu};
+use tce_sim::SimError;
 
 use crate::actors::{Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
@@ -48,21 +49,22 @@ pub struct Arena {
 pub struct Learned {
     /// Evaluation of the last checkpoint, per member; empty without a simulator.
     pub evaluations: Vec<Evaluation>,
-    /// Means of the learner's figures over its last report, per member.
-    pub figures: BTreeMap<String, Vec<f64>>,
+    /// Means of the learner's figures over its last report, per member; None is a number that is not finite.
+    pub figures: BTreeMap<String, Vec<Option<f64>>>,
     /// Seconds of training.
     pub seconds: f64,
 }
 
 impl Learned {
-    /// The normalised scores, per member.
-    pub fn scores(&self) -> Vec<f64> {
-        self.evaluations.iter().filter_map(|e| e.score).collect()
+    /// The normalised scores, per member; None where a policy could not be judged.
+    pub fn scores(&self) -> Vec<Option<f64>> {
+        self.evaluations.iter().map(|e| e.score).collect()
     }
 }
 
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
-/// policy is the same.
+/// policy is the same. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
+/// whatever happens then.
 pub fn learn(
     data: Vec<MemberData>,
     config: &LearnerConfig,
@@ -70,7 +72,8 @@ pub fn learn(
     arena: Option<Arena>,
     metrics: &mut Metrics,
     device: &Device,
-) -> Result<(Vec<Policy>, Learned)> {
+    keep: impl FnOnce(&[Policy]) -> Result<()>,
+) -> Result<Learned> {
     let started = std::time::Instant::now();
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
     let size = if is_cpu(device) { 1 } else { data.len().max(1) };
@@ -90,8 +93,10 @@ pub fn learn(
             metrics.log("learn", report.step, m, figures)?;
         }
         for (name, values) in &report.metrics {
-            let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![f64::NAN; seeds.len()]);
-            figures[k * size..][..values.len()].copy_from_slice(values);
+            let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![None; seeds.len()]);
+            for (figure, value) in figures[k * size..].iter_mut().zip(values) {
+                *figure = value.is_finite().then_some(*value);
+            }
         }
         let number = report.step.checked_div(evaluation.every).unwrap_or(0);
         if let (Some(arena), true) = (arena, due(report.step) && number > judged[k]) {
@@ -107,6 +112,7 @@ pub fn learn(
         return Err(Error::Interrupted);
     }
     let policies: Vec<Policy> = learners.iter().flat_map(|l| l.policies()).collect();
+    keep(&policies)?;
     if let Some(arena) = arena {
         learned.evaluations = judge(&policies, &seeds, evaluation.episodes, arena)?;
         for (m, e) in learned.evaluations.iter().enumerate() {
@@ -114,7 +120,7 @@ pub fn learn(
         }
     }
     learned.seconds = started.elapsed().as_secs_f64();
-    Ok((policies, learned))
+    Ok(learned)
 }
 
 /// The members of `data` as one training, before its first step.
@@ -164,6 +170,16 @@ fn judge(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Arena) -> R
     policies
         .par_iter()
         .zip(seeds)
-        .map(|(p, &seed)| evaluate(p, arena.agent, arena.shift, episodes, Streams::new(seed), true, arena.reference))
+        .map(|(p, &seed)| {
+            let judged = evaluate(p, arena.agent, arena.shift, episodes, Streams::new(seed), true, arena.reference);
+            match judged {
+                // One member that has diverged must not cost the others their result.
+                Err(Error::Sim(e @ SimError::NotFinite { .. })) => {
+                    eprintln!("seed {seed}: {e}; it has no score");
+                    Ok(Evaluation::failed(e.to_string()))
+                }
+                judged => judged,
+            }
+        })
         .collect()
 }

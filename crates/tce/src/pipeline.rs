@@ -24,8 +24,8 @@ pub struct Summary {
     pub name: String,
     /// The seeds, one member each.
     pub seeds: Vec<u64>,
-    /// Normalised score per seed.
-    pub scores: Vec<f64>,
+    /// Normalised score per seed; None if its policy could not be judged. Empty without a simulator.
+    pub scores: Vec<Option<f64>>,
     /// Learning and evaluation.
     pub learned: Learned,
     /// Rows that joined the target rows, per member.
@@ -109,7 +109,8 @@ pub fn run(
     let target = Arc::new(inputs.target.rows.clone());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
-        trajectories.push(extra[0].clone());
+        // Generated rows among them are no trajectories.
+        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].clone() });
     }
     let data = |(m, &seed): (usize, &u64)| MemberData {
         seed,
@@ -127,12 +128,14 @@ pub fn run(
     let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
     drop(extra);
     let mut metrics = Metrics::start(stage.directory())?;
-    let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, device)?;
-    for (policy, seed) in policies.iter().zip(seeds) {
-        let file = format!("policy-seed{seed}.safetensors");
-        policy.save(&stage.file(&file))?;
-        files.push(file);
-    }
+    let learned = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, device, |policies| {
+        for (policy, seed) in policies.iter().zip(seeds) {
+            let file = format!("policy-seed{seed}.safetensors");
+            policy.save(&stage.file(&file))?;
+            files.push(file);
+        }
+        Ok(())
+    })?;
     let summary = Summary {
         name: name.to_owned(),
         seeds: seeds.to_vec(),

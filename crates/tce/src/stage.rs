@@ -14,7 +14,7 @@ use tce_base::{FileError, sha256_file, sha256_hex, write_json};
 use crate::error::{Error, Result};
 
 /// Changes when the same specification would give other bytes.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// What marks a stage as done.
 #[derive(Serialize, Deserialize)]

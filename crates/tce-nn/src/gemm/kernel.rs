@@ -343,10 +343,11 @@ unsafe fn tile<V: Simd, const MR: usize, const NV: usize>(
                         }
                     }
                 }
+                // After the last term these point past their matrix, which only `wrapping_add` may.
                 for left in &mut lefts {
-                    *left = left.add($count * a_column);
+                    *left = left.wrapping_add($count * a_column);
                 }
-                b = b.add($count * b_row);
+                b = b.wrapping_add($count * b_row);
             };
         }
         for _ in 0..terms / 4 {

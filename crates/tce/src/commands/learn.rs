@@ -66,7 +66,8 @@ impl Learn {
         self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        if self.out.join("metrics.jsonl").exists() {
+        // A training that was interrupted left metrics, but no result.
+        if self.out.join("summary.json").exists() {
             return Err(Error::Usage(format!(
                 "{} holds the results of another learning; choose another --out",
                 self.out.display()
@@ -97,13 +98,15 @@ impl Learn {
         let data = seeds.iter().map(member).collect();
         let mut metrics = Metrics::start(&self.out)?;
         tce_base::write_atomically(&self.out.join("config.toml"), config.to_toml().as_bytes())?;
-        let (policies, learned) = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, &cpu())?;
         let mut files = Vec::new();
-        for (policy, seed) in policies.iter().zip(&seeds) {
-            let file = self.out.join(format!("policy-seed{seed}.safetensors"));
-            policy.save(&file)?;
-            files.push(file);
-        }
+        let learned = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, &cpu(), |policies| {
+            for (policy, seed) in policies.iter().zip(&seeds) {
+                let file = self.out.join(format!("policy-seed{seed}.safetensors"));
+                policy.save(&file)?;
+                files.push(file);
+            }
+            Ok(())
+        })?;
         let report = Report { policies: files, seeds, learned };
         tce_base::write_json(&self.out.join("summary.json"), &report)?;
         output.print(&report, |r| {
@@ -111,7 +114,7 @@ impl Learn {
                 let evaluation = r.learned.evaluations.get(m);
                 [
                     path.display().to_string(),
-                    evaluation.map_or("-".into(), |e| plus_minus(&e.returns)),
+                    evaluation.filter(|e| e.failed.is_none()).map_or("-".into(), |e| plus_minus(&e.returns)),
                     evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
                 ]
             });

@@ -89,13 +89,17 @@ fn render(report: &Report) -> String {
             .learned
             .evaluations
             .iter()
+            .filter(|e| e.failed.is_none())
             .map(|e| e.returns.iter().sum::<f64>() / e.returns.len() as f64)
             .collect();
+        let scores: Vec<f64> = r.summary.scores.iter().flatten().copied().collect();
+        let seeds = r.summary.seeds.len();
+        let failed = r.summary.learned.evaluations.iter().filter(|e| e.failed.is_some()).count();
         [
             if r.floor { format!("{} (floor)", r.title) } else { r.title.clone() },
-            plus_minus(&r.summary.scores),
+            plus_minus(&scores),
             plus_minus(&returns),
-            r.summary.seeds.len().to_string(),
+            if failed > 0 { format!("{seeds} ({failed} diverged)") } else { seeds.to_string() },
             r.summary.extra_rows.to_string(),
             format!("{:.0} s", r.summary.seconds),
         ]
