@@ -1,8 +1,10 @@
 //! Agents that act and learn: SAC in an environment, at D4RL's specification, in pieces of hours.
 //!
 //! Environment steps and updates in turns (by default one to one); the first steps are uniformly random, or those of the
-//! policy that a training begins with. Everything random is indexed by step, update or episode, and a checkpoint is taken between episodes, so that a training that was stopped goes on to the
-//! same bytes. A directory holds
+//! policy that a training begins with. Everything random is indexed by step, update or episode, and a checkpoint is taken
+//! between episodes, so that a training that was stopped goes on to the same bytes. A step of the simulator takes .06 to .25 ms,
+//! an update of 256 rows 10 ms: what keeps the cores busy is trainings side by side, not a step beside its update.
+//! A directory holds
 //!
 //! | file | content |
 //! |---|---|
