@@ -118,8 +118,10 @@ fn flag() -> &'static Arc<AtomicBool> {
     FLAG.get_or_init(Default::default)
 }
 
-/// From now on SIGINT and SIGTERM set a flag that long work looks at ([`interrupted`]); a second one ends the process.
+/// From now on SIGINT, SIGTERM and SIGUSR1 (a batch system's warning before its time limit) set a flag that long work looks at
+/// ([`interrupted`]). A second SIGINT or SIGTERM ends the process.
 pub fn listen_for_interrupts() {
+    let _ = signal_hook::flag::register(signal_hook::consts::SIGUSR1, flag().clone());
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         // The order matters: the shutdown looks at the flag before the second hook sets it.
         let _ = signal_hook::flag::register_conditional_shutdown(signal, 130, flag().clone());

@@ -19,7 +19,7 @@ mod train;
 
 pub use data::{Condition, Part, ScoreData};
 pub use error::DiffusionError;
-pub use model::{Request, ScoreModel, uniform_labels};
+pub use model::{Chunks, Request, ScoreModel, uniform_labels};
 pub use network::{BoundNetwork, NetworkConfig, ScoreNetwork};
 pub use process::{Edm, Grid, Increment, Level, Precondition, Process, Start, Ve, Vp};
 pub use sampler::{Denoiser, Sampler};

@@ -1,12 +1,12 @@
 //! A trained score network with the process it was trained for: sampling, files.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::random::{fill_normal, fill_uniform};
-use tce_base::{Progress, Streams};
+use tce_base::{FileError, Progress, Sealed, Streams, read_sealed, write_sealed};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
 
 use crate::{BoundNetwork, Denoiser, DiffusionError, Level, NetworkConfig, Process, Sampler, ScoreNetwork};
@@ -45,6 +45,40 @@ pub struct Request<'a> {
     pub condition: &'a [f32],
     /// Training rows `[P, rows, d]` or `[rows, d]` to start from; needed where [`Process::starts_at_data`] only.
     pub start: Option<&'a [f32]>,
+    /// Where finished chunks are kept and taken from, so that an interrupted sampling goes on.
+    pub kept: Option<Chunks<'a>>,
+}
+
+/// Sampled chunks on disk: one file of checksummed f32 for each member and 4096 rows.
+#[derive(Clone, Copy, Debug)]
+pub struct Chunks<'a> {
+    /// Their directory.
+    pub directory: &'a Path,
+    /// A word that stands for all that decides the samples, besides name, member and chunk.
+    pub key: &'a str,
+}
+
+impl Chunks<'_> {
+    fn path(&self, name: &str, member: usize, chunk: usize) -> PathBuf {
+        self.directory.join(format!("{name}-{member}-{chunk}.chunk"))
+    }
+
+    /// The chunk of `n` numbers, if it is there and whole.
+    fn load(&self, name: &str, member: usize, chunk: usize, n: usize) -> Result<Option<Vec<f32>>, FileError> {
+        let read = read_sealed(&self.path(name, member, chunk), self.key)?;
+        Ok(match read {
+            Sealed::Whole(bytes) if bytes.len() == 4 * n => {
+                Some(bytes.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect())
+            }
+            // Sampled again, to the same numbers.
+            _ => None,
+        })
+    }
+
+    fn save(&self, name: &str, member: usize, chunk: usize, rows: &[f32]) -> Result<(), FileError> {
+        let bytes: Vec<u8> = rows.iter().flat_map(|v| v.to_le_bytes()).collect();
+        write_sealed(&self.path(name, member, chunk), self.key, &bytes)
+    }
 }
 
 impl ScoreModel {
@@ -133,6 +167,15 @@ impl ScoreModel {
             .collect();
         tasks.into_par_iter().try_for_each(|(m, k, chunk)| {
             let n = chunk.len() / d;
+            if let Some(kept) = &request.kept
+                && let Some(rows) = kept.load(request.name, m, k, chunk.len()).map_err(NetworkError::from)?
+            {
+                if let Some(progress) = progress {
+                    progress.inc((n * sampler.evaluations()) as u64);
+                }
+                chunk.copy_from_slice(&rows);
+                return Ok(());
+            }
             let part = |values: &[f32], width: usize| -> Vec<f32> {
                 let member = if values.len() == rows * width { 0 } else { m * rows };
                 values[(member + k * CHUNK) * width..][..n * width].to_vec()
@@ -140,9 +183,12 @@ impl ScoreModel {
             let condition = part(request.condition, c);
             let start = start.map(|s| part(s, d));
             let rng = streams[m].indexed(&format!("sample/{}", request.name), k as u64);
-            networks[m]
-                .sample_chunk(condition, start, n, sampler, rng, progress)
-                .map(|rows| chunk.copy_from_slice(&rows))
+            let rows = networks[m].sample_chunk(condition, start, n, sampler, rng, progress)?;
+            chunk.copy_from_slice(&rows);
+            match &request.kept {
+                Some(kept) => Ok(kept.save(request.name, m, k, &rows).map_err(NetworkError::from)?),
+                None => Ok::<_, DiffusionError>(()),
+            }
         })?;
         Ok(out)
     }

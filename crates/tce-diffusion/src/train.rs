@@ -7,7 +7,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
 use tce_base::{Progress, Streams, interrupted};
-use tce_nn::{Averaged, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host, tensor};
+use tce_nn::{
+    Averaged, Checkpoints, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host, tensor,
+};
 
 use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
 
@@ -139,20 +141,33 @@ impl Trainer {
     /// 100 steps and at the end; a loss is the mean over rows and dimensions, 1 for a network that knows nothing of VE's
     /// or VP's noise.
     ///
+    /// With `checkpoints` the training goes on from the newest one, and keeps one now and then and when the user interrupts; the
+    /// result and all reports are then those of an undisturbed training.
+    ///
     /// # Errors
-    /// If the data does not fit the network, the loss is no number any more, or the user interrupts; then the trainer is
-    /// whole, and [`Trainer::state`] can be kept.
+    /// If the data does not fit the network, the loss is no number any more, a checkpoint cannot be used or written, or the user
+    /// interrupts; then the trainer is whole, and [`Trainer::state`] can be kept.
     pub fn train(
         &mut self,
         data: &[ScoreData],
         steps: u64,
+        checkpoints: &mut Checkpoints,
         mut on_loss: impl FnMut(u64, &[f32]),
     ) -> Result<(), DiffusionError> {
         self.check_data(data)?;
+        if let Some((_, state, path)) = checkpoints.restore() {
+            self.restore(&state, &path)?;
+        }
         let progress = Progress::new(format!("train {}", self.name), steps.saturating_sub(self.step), "steps");
         let (mut sum, mut count) = (None, 0u64);
         while self.step < steps {
-            if interrupted() || self.stop.load(Ordering::Relaxed) {
+            // Between two reports a checkpoint would have to hold the losses since the last one.
+            let whole = count == 0;
+            let stop = interrupted() || self.stop.load(Ordering::Relaxed);
+            if whole && self.step > 0 && (stop || checkpoints.due()) {
+                checkpoints.keep(self.step, self.state()).map_err(NetworkError::from)?;
+            }
+            if stop && whole {
                 let label = format!("training of {}", self.name);
                 return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
             }

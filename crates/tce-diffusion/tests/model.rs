@@ -9,7 +9,7 @@ use tce_diffusion::{
     Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, Start, TrainConfig, Trainer, Ve, Vp,
     uniform_labels,
 };
-use tce_nn::cpu;
+use tce_nn::{Checkpoints, cpu};
 
 fn normal(name: &str, n: usize, mean: f32, std: f32) -> Vec<f32> {
     let mut x = vec![0.0; n];
@@ -21,7 +21,7 @@ fn train(process: Process, spec: NetworkConfig, data: &ScoreData, members: u64, 
     let streams: Vec<_> = (0..members).map(Streams::new).collect();
     let config = TrainConfig { learning_rate: rate, ema: 0.98, ..TrainConfig::default() };
     let mut trainer = Trainer::new("toy", spec, process, config, &streams, &cpu()).unwrap();
-    trainer.train(std::slice::from_ref(data), steps, |_, _| {}).unwrap();
+    trainer.train(std::slice::from_ref(data), steps, &mut Checkpoints::none(), |_, _| {}).unwrap();
     trainer.model()
 }
 
@@ -42,7 +42,7 @@ fn the_label_moves_samples_between_the_domains() {
         let model = train(process, small(1, 1), &data, 1, 1500, 2e-3);
         let distances = [0.0, 0.5, 1.0].map(|y| {
             let n = 2000;
-            let request = Request { name: "x", rows: n, condition: &vec![y; n], start: None };
+            let request = Request { name: "x", rows: n, condition: &vec![y; n], start: None, kept: None };
             let x = model.sample(request, &sampler, &[Streams::new(5)], None).unwrap();
             [&source, &target].map(|rows| sliced_wasserstein(&x, rows, 1, 1, &Streams::new(0)))
         });
@@ -62,7 +62,7 @@ fn samples_follow_their_condition() {
     let data = ScoreData::conditioned(&rows, 1, &c, 1).unwrap();
     let model = train(Process::Ve(Ve { start: Start::Data, ..Ve::default() }), small(1, 1), &data, 1, 1500, 2e-3);
     let on = normal("new", 3000, 0.0, 1.0);
-    let request = Request { name: "x", rows: 3000, condition: &on, start: Some(&rows) };
+    let request = Request { name: "x", rows: 3000, condition: &on, start: Some(&rows), kept: None };
     let x = model.sample(request, &Sampler::Heun { steps: 18 }, &[Streams::new(5)], None).unwrap();
     let error = (x.iter().zip(&on).map(|(x, c)| (x - c).powi(2)).sum::<f32>() / 3000.0).sqrt();
     assert!(error > 0.05 && error < 0.25, "{error}");
@@ -81,7 +81,7 @@ fn bytes_do_not_depend_on_the_threads_nor_on_the_population() {
     let labels: Vec<f32> = (0..2).flat_map(|m| uniform_labels(&Streams::new(m), "y", n, 0.2)).collect();
     assert!(labels.iter().all(|y| (0.0..0.2).contains(y)));
     let sampler = Sampler::PredictorCorrector { steps: 5, snr: 0.16, corrections: 1 };
-    let request = Request { name: "state", rows: n, condition: &labels, start: None };
+    let request = Request { name: "state", rows: n, condition: &labels, start: None, kept: None };
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -121,7 +121,7 @@ fn files_keep_the_model() {
 #[test]
 fn requests_that_do_not_fit_are_refused() {
     let (model, streams) = population();
-    let request = Request { name: "x", rows: 3, condition: &[0.0; 3], start: None };
+    let request = Request { name: "x", rows: 3, condition: &[0.0; 3], start: None, kept: None };
     let error = |request, sampler: Sampler, streams: &[Streams]| {
         model.sample(request, &sampler, streams, None).unwrap_err().to_string()
     };

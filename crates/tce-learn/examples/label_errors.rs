@@ -8,7 +8,7 @@ use tce_base::Streams;
 use tce_data::{LoadOptions, Standardizer, load};
 use tce_learn::pair_model::{PairConfig, PairInput};
 use tce_learn::{LabelConfig, Member, train_labels};
-use tce_nn::cpu;
+use tce_nn::{Checkpoints, cpu};
 
 fn main() {
     let path = std::env::args().nth(1).expect("a file");
@@ -30,7 +30,9 @@ fn main() {
         ("next, cosine, drop .1", PairConfig { input: PairInput::Next, ..default.clone() }),
     ] {
         let config = LabelConfig { model, steps, ..LabelConfig::default() };
-        let models = train_labels(&[member(1)], &config, &cpu()).expect("good data").expect("not interrupted");
+        let models = train_labels(&[member(1)], &config, &mut Checkpoints::none(), &cpu())
+            .expect("good data")
+            .expect("not interrupted");
         for errors in models.errors() {
             println!("{name}: {:?}", errors.expect("rows held out"));
         }

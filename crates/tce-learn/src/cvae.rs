@@ -20,7 +20,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
+use tce_nn::{Activation, Checkpoints, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::blocks::map_rows;
 use crate::buffer::{Buffer, Minibatch};
@@ -166,6 +166,8 @@ pub fn train_cvae(buffer: &Buffer, config: &CvaeConfig, device: &Device) -> Resu
     let target = buffer.target_only(config.batch)?.with_stream("cvae batch");
     let mut learner = CvaeLearner::new(&target, config, device)?;
     let steps = Steps::new(config.steps, 0);
-    let outcome = train(&mut learner, &target, steps, "behaviour CVAE", device, |_, _| Ok::<_, LearnError>(()))?;
+    let outcome = train(&mut learner, &target, steps, "behaviour CVAE", &mut Checkpoints::none(), device, |_, _| {
+        Ok::<_, LearnError>(())
+    })?;
     Ok((!outcome.interrupted).then(|| learner.model()))
 }

@@ -21,7 +21,7 @@ use std::sync::Arc;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 use tce_data::{Standardizer, Transitions};
-use tce_nn::{Device, NamedParameters, NetworkError};
+use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError};
 
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
@@ -244,18 +244,20 @@ impl Learner for LabelModels {
     }
 }
 
-/// Trains the models on the target part of each member. None if the user interrupted it.
+/// Trains the models on the target part of each member, from and with `checkpoints`. None if the user interrupted it.
 ///
 /// # Errors
 /// If the configuration or the data cannot be used.
 pub fn train_labels(
     members: &[Member],
     config: &LabelConfig,
+    checkpoints: &mut Checkpoints,
     device: &Device,
 ) -> Result<Option<LabelModels>, LearnError> {
     let mut models = LabelModels::new(members, config, device)?;
     let (buffer, steps) = (models.buffer.clone(), Steps::new(config.steps, 0));
-    let outcome = train(&mut models, &buffer, steps, "label models", device, |_, _| Ok::<_, LearnError>(()))?;
+    let outcome =
+        train(&mut models, &buffer, steps, "label models", checkpoints, device, |_, _| Ok::<_, LearnError>(()))?;
     Ok((!outcome.interrupted).then_some(models))
 }
 

@@ -6,9 +6,10 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams, interrupted, random::fill_normal};
-use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
+use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, tensor};
 
 use crate::buffer::{Buffer, Minibatch};
+use crate::error::LearnError;
 use crate::policy::Policy;
 
 /// Losses and other figures are taken every so many steps: they cost time, and their means need no more.
@@ -51,7 +52,29 @@ pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 
 pub struct Meter {
     #[serde(skip)]
     active: bool,
+    #[serde(with = "bits")]
     sums: BTreeMap<String, (Vec<f64>, u64)>,
+}
+
+/// Sums as the bits of the numbers: JSON has no NaN, and a member that has diverged has nothing else.
+mod bits {
+    use std::collections::BTreeMap;
+
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    type Sums<T> = BTreeMap<String, (Vec<T>, u64)>;
+
+    fn map<A: Copy, B>(sums: &Sums<A>, f: fn(A) -> B) -> Sums<B> {
+        sums.iter().map(|(name, (sum, n))| (name.clone(), (sum.iter().map(|v| f(*v)).collect(), *n))).collect()
+    }
+
+    pub fn serialize<S: Serializer>(sums: &Sums<f64>, to: S) -> Result<S::Ok, S::Error> {
+        map(sums, f64::to_bits).serialize(to)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Sums<f64>, D::Error> {
+        Ok(map(&Sums::<u64>::deserialize(from)?, f64::from_bits))
+    }
 }
 
 impl Meter {
@@ -160,16 +183,18 @@ pub struct Lane<'a, L: ?Sized> {
 /// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one lane.
 ///
 /// # Errors
-/// That of `on_report`.
-pub fn train<L: Learner + ?Sized, E>(
+/// That of `on_report`, and those of the checkpoints.
+pub fn train<L: Learner + ?Sized, E: From<LearnError>>(
     learner: &mut L,
     buffer: &Buffer,
     steps: Steps,
     label: &str,
+    checkpoints: &mut Checkpoints,
     device: &Device,
     mut on_report: impl FnMut(&Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    train_side_by_side(&mut [Lane { learner, buffer }], steps, label, device, |_, report, l| on_report(report, l))
+    let mut lanes = [Lane { learner, buffer }];
+    train_side_by_side(&mut lanes, steps, label, checkpoints, device, |_, report, l| on_report(report, l))
 }
 
 /// Trains the learners of all lanes, with one progress bar named `label`.
@@ -179,21 +204,38 @@ pub fn train<L: Learner + ?Sized, E>(
 /// to evaluate or save it; its error ends the training. The learners' device is the one of their parameters; batches are
 /// made on `device`, each while the update before it runs.
 ///
+/// With `checkpoints` the training goes on from the newest one, and keeps one now and then and when the user interrupts: the
+/// result and all reports are then those of an undisturbed training. A training that is done leaves them to the caller, who removes
+/// them once the result is safe.
+///
 /// # Errors
-/// That of `on_report`.
-pub fn train_side_by_side<L: Learner + ?Sized, E>(
+/// That of `on_report`; if a checkpoint does not fit the learners or cannot be written.
+pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     lanes: &mut [Lane<L>],
     steps: Steps,
     label: &str,
+    checkpoints: &mut Checkpoints,
     device: &Device,
     mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    let total = steps.to.saturating_sub(steps.from) * lanes.len() as u64;
-    let progress = Progress::new(label, total, "steps");
     let mut runs: Vec<_> = lanes.iter_mut().map(|lane| Run { lane, meter: Meter::default(), next: None }).collect();
     let mut step = steps.from;
+    if let Some((at, state, path)) = checkpoints.restore() {
+        for (k, run) in runs.iter_mut().enumerate() {
+            run.restore(k, &state, &path).map_err(LearnError::from)?;
+        }
+        step = at;
+    }
+    let total = steps.to.saturating_sub(step) * runs.len() as u64;
+    let progress = Progress::new(label, total, "steps");
     while step < steps.to {
-        if interrupted() {
+        let stop = interrupted();
+        if step > steps.from && (stop || checkpoints.due()) {
+            let mut state = NamedParameters::default();
+            runs.iter().enumerate().for_each(|(k, run)| run.keep(k, &mut state));
+            checkpoints.keep(step, state).map_err(LearnError::from)?;
+        }
+        if stop {
             return Ok(Outcome { step, interrupted: true });
         }
         let due = match steps.report_every {
@@ -226,6 +268,30 @@ struct Run<'a, 'b, L: ?Sized> {
 }
 
 impl<L: Learner + ?Sized> Run<'_, '_, L> {
+    /// Adds the state of this lane, number `k`, to a checkpoint.
+    fn keep(&self, k: usize, state: &mut NamedParameters) {
+        let own = self.lane.learner.state();
+        state.tensors.extend(own.tensors.into_iter().map(|(name, tensor)| (format!("{k}/{name}"), tensor)));
+        state.metadata.extend(own.metadata.into_iter().map(|(name, value)| (format!("{k}/{name}"), value)));
+        state.metadata.insert(format!("{k}/meter"), serde_json::to_string(&self.meter).expect("plain data"));
+    }
+
+    /// Puts back what [`Run::keep`] added.
+    fn restore(&mut self, k: usize, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        let prefix = format!("{k}/");
+        let mut own = NamedParameters::default();
+        let tensors = state.tensors.iter().filter_map(|(n, t)| Some((n.strip_prefix(&prefix)?.to_owned(), t.clone())));
+        own.tensors.extend(tensors);
+        let metadata = state.metadata.iter();
+        own.metadata.extend(metadata.filter_map(|(n, v)| Some((n.strip_prefix(&prefix)?.to_owned(), v.clone()))));
+        let meter = own.metadata.remove("meter").and_then(|text| serde_json::from_str(&text).ok());
+        self.meter = meter.ok_or_else(|| NetworkError::Format {
+            path: path.to_owned(),
+            reason: format!("no figures of lane {k}: no checkpoint of this training"),
+        })?;
+        self.lane.learner.restore(&own, path)
+    }
+
     fn advance(&mut self, turn: std::ops::Range<u64>, end: u64, device: &Device, progress: &Progress) {
         let Lane { learner, buffer } = self.lane;
         for step in turn {
@@ -254,6 +320,16 @@ mod tests {
         meter.record("x", &tensor(vec![4.0, 4.0, 0.0, 0.0], [2, 2, 1], &cpu()));
         assert_eq!(meter.take()["x"], [3.0, 7.5]);
         assert!(meter.take().is_empty());
+    }
+
+    #[test]
+    fn figures_survive_a_checkpoint_whatever_they_are() {
+        let mut meter = Meter::default();
+        meter.add("x", vec![f64::NAN, 0.1 + 0.2]);
+        let text = serde_json::to_string(&meter).unwrap();
+        let mut back: Meter = serde_json::from_str(&text).unwrap();
+        let x = back.take()["x"].clone();
+        assert!(x[0].is_nan() && x[1] == 0.1 + 0.2, "{x:?}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use tce_base::Streams;
 use tce_data::{Standardizer, Transitions};
 use tce_learn::pair_model::{PairConfig, PairInput};
 use tce_learn::{LabelConfig, Member, TerminalHandling, train_labels};
-use tce_nn::cpu;
+use tce_nn::{Checkpoints, cpu};
 
 /// s in [-3, 3]², s' = s + .05 a, r = s'_0 + 2, terminal where s'_0 > 2; a third dimension that is always 1.
 fn data(rows: usize) -> Arc<Transitions> {
@@ -40,7 +40,8 @@ fn config(input: PairInput) -> LabelConfig {
 
 #[test]
 fn labels_follow_the_laws_of_the_system() {
-    let models = train_labels(&members(&[1, 2]), &config(PairInput::Delta), &cpu()).unwrap().unwrap();
+    let models =
+        train_labels(&members(&[1, 2]), &config(PairInput::Delta), &mut Checkpoints::none(), &cpu()).unwrap().unwrap();
     for errors in models.errors() {
         let errors = errors.unwrap();
         assert_eq!(errors.rows, 100);
@@ -75,7 +76,7 @@ fn labels_follow_the_laws_of_the_system() {
 #[test]
 fn differences_carry_what_successors_hide() {
     let error = |input| {
-        let models = train_labels(&members(&[1]), &config(input), &cpu()).unwrap().unwrap();
+        let models = train_labels(&members(&[1]), &config(input), &mut Checkpoints::none(), &cpu()).unwrap().unwrap();
         models.errors()[0].unwrap().action_rmse
     };
     let (delta, next) = (error(PairInput::Delta), error(PairInput::Next));
@@ -85,8 +86,14 @@ fn differences_carry_what_successors_hide() {
 #[test]
 fn a_classifier_that_is_not_there_is_refused() {
     let config = LabelConfig { steps: 1, ..config(PairInput::Delta) };
-    let models =
-        train_labels(&members(&[1]), &LabelConfig { learn_terminals: false, ..config }, &cpu()).unwrap().unwrap();
+    let models = train_labels(
+        &members(&[1]),
+        &LabelConfig { learn_terminals: false, ..config },
+        &mut Checkpoints::none(),
+        &cpu(),
+    )
+    .unwrap()
+    .unwrap();
     let error = models.label(&[(vec![0.0; 3], vec![0.0; 3])], TerminalHandling::Learned).unwrap_err();
     assert!(error.to_string().contains("learn_terminals"), "{error}");
 }

@@ -1,6 +1,5 @@
 //! Learners end to end on small problems with known answers.
 
-use std::convert::Infallible;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -11,10 +10,10 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, Learner, Member, Policy, PolicyLearner, Steps, best_trajectories,
-    train, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Policy, PolicyLearner, Steps,
+    best_trajectories, train, train_labels,
 };
-use tce_nn::cpu;
+use tce_nn::{Checkpoints, cpu};
 
 fn member(seed: u64, data: &Arc<Transitions>, standardised: bool) -> Member {
     let dim = data.obs_dim;
@@ -25,9 +24,9 @@ fn member(seed: u64, data: &Arc<Transitions>, standardised: bool) -> Member {
 
 fn run<L: Learner>(learner: &mut L, buffer: &Buffer, steps: u64) -> tce_learn::Report {
     let mut last = None;
-    train(learner, buffer, Steps::new(steps, 0), "test", &cpu(), |report, _| {
+    train(learner, buffer, Steps::new(steps, 0), "test", &mut Checkpoints::none(), &cpu(), |report, _| {
         last = Some(report.clone());
-        Ok::<_, Infallible>(())
+        Ok::<_, LearnError>(())
     })
     .unwrap();
     last.unwrap()
@@ -95,7 +94,7 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
             let mut iql = Iql::new(&buffer, &IqlConfig::default(), Regulariser::None, 3, &cpu()).unwrap();
             run(&mut iql, &buffer, 3);
             let labels = LabelConfig { steps: 3, learn_terminals: true, ..LabelConfig::default() };
-            let labels = train_labels(&members, &labels, &cpu()).unwrap().unwrap();
+            let labels = train_labels(&members, &labels, &mut Checkpoints::none(), &cpu()).unwrap().unwrap();
             (iql.state().to_bytes(), labels.state().to_bytes())
         })
     };
@@ -110,7 +109,7 @@ fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
     let new = || Iql::new(&buffer, &config, Regulariser::None, 20, &cpu()).unwrap();
     let go = |iql: &mut Iql, from, to| {
         let steps = Steps { from, to, report_every: 0 };
-        train(iql, &buffer, steps, "test", &cpu(), |_, _| Ok::<_, Infallible>(())).unwrap();
+        train(iql, &buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |_, _| Ok::<_, LearnError>(())).unwrap();
     };
     let mut whole = new();
     go(&mut whole, 0, 20);

@@ -8,6 +8,7 @@
 
 mod activation;
 mod adam;
+mod checkpoint;
 mod dense;
 mod gemm;
 mod kernels;
@@ -21,6 +22,7 @@ mod trained;
 
 pub use activation::Activation;
 pub use adam::{Adam, AdamConfig};
+pub use checkpoint::{Checkpoints, set_checkpoint_seconds};
 pub use dense::{dense, dense_composed};
 pub use layers::{Dense, LayerNorm, Mlp, MlpConfig};
 pub use params::{NamedParameters, NetworkError, moving_average, parameter_count};

@@ -12,13 +12,14 @@
 //! | `metrics.jsonl`, `tensorboard/` | losses and evaluations; cut back to the checkpoint when the training goes on |
 //! | `replay-STEP.hdf5`, `learner-STEP.safetensors` | the last checkpoint's replay buffer and networks |
 //! | `ledger.json` | the checkpoint: step, episode, evaluations, snapshots, and the SHA-256 of the two; written last |
+//! | `previous.json` | the ledger of the checkpoint before, whose files are kept, too: for a file that goes bad |
 //! | `policy-SCORE.safetensors`, `policy.safetensors` | snapshots, and the policy of the last evaluation, each with a card |
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_uniform;
-use tce_base::{FileError, Progress, Streams, interrupted, sha256_file, write_json};
+use tce_base::{FileError, Progress, Streams, interrupted, sha256_file, write_atomically, write_json};
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, load, reference_scores, save_d4rl};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{Buffer, Learner, Meter, Policy, PolicyLearner};
@@ -120,6 +121,31 @@ impl Ledger {
     /// If it is damaged.
     pub fn read(directory: &Path) -> Result<Option<Self>> {
         read_json(&directory.join("ledger.json"))
+    }
+
+    /// The newer one of the two checkpoints in `directory` that is whole, if there is any.
+    ///
+    /// # Errors
+    /// If there are checkpoints, and none of them is whole.
+    fn newest_whole(directory: &Path) -> Result<Option<Self>> {
+        let whole = |name: &str| -> Result<Option<Self>> {
+            let ledger: Option<Self> = read_json(&directory.join(name))?;
+            for (file, hash) in ledger.iter().flat_map(|l| &l.files) {
+                verify(&directory.join(file), hash)?;
+            }
+            Ok(ledger)
+        };
+        let damage = match whole("ledger.json") {
+            Ok(ledger) => return Ok(ledger),
+            Err(damage) => damage,
+        };
+        match whole("previous.json") {
+            Ok(Some(ledger)) => {
+                eprintln!("{damage}; going on from the checkpoint before, at step {}", ledger.step);
+                Ok(Some(ledger))
+            }
+            _ => Err(damage),
+        }
     }
 }
 
@@ -227,7 +253,7 @@ impl Training {
         std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let lock = lock(directory)?;
         let path = directory.join("settings.json");
-        let ledger = Ledger::read(directory)?;
+        let ledger = Ledger::newest_whole(directory)?;
         if ledger.is_some() {
             let found: Settings = read_json(&path)?.ok_or_else(|| {
                 Error::Failed(format!("{}: missing, beside a checkpoint; restore the directory", path.display()))
@@ -264,9 +290,8 @@ impl Training {
             verify(&learner, &hash)?;
             sac.restore(&NamedParameters::load(&learner)?, &learner)?;
         }
-        for (file, hash) in &ledger.files {
+        for (file, _) in &ledger.files {
             let path = directory.join(file);
-            verify(&path, hash)?;
             if file.ends_with(".hdf5") {
                 let options = LoadOptions { dims: Some(agent.dims()), ..LoadOptions::default() };
                 *buffer.replay_mut() = load(&path, &options)?.transitions;
@@ -279,7 +304,7 @@ impl Training {
             env: Env::new(agent, settings.shift)?,
             observation: vec![0.0; agent.dims().0],
             length: 0,
-            metrics: Metrics::resume(directory, ledger.step)?,
+            metrics: Metrics::resume(directory, |_, at| at <= ledger.step)?,
             lock,
             progress: Progress::new(label, goal.steps.saturating_sub(ledger.step), "steps"),
             saved: ledger.step,
@@ -426,13 +451,16 @@ impl Training {
         self.sac.state().save(&self.directory.join(&learner))?;
         let hashed = |name: String| Ok((name.clone(), sha256_file(&self.directory.join(&name))?));
         let files = [replay, learner].into_iter().map(hashed).collect::<Result<Vec<_>>>()?;
-        self.ledger.files = files;
+        let before = std::mem::replace(&mut self.ledger.files, files);
+        if let (false, Ok(bytes)) = (before.is_empty(), std::fs::read(self.directory.join("ledger.json"))) {
+            write_atomically(&self.directory.join("previous.json"), &bytes)?;
+        }
         write_json(&self.directory.join("ledger.json"), &self.ledger)?;
-        // The new checkpoint is whole: older ones, and what a killed program left, cost space only.
+        // Older checkpoints, and what a killed program left, cost space only.
         for entry in std::fs::read_dir(&self.directory).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
             let ours = name.starts_with("replay-") || name.starts_with("learner-") || name.ends_with(".part");
-            if ours && self.ledger.files.iter().all(|(kept, _)| *kept != name) {
+            if ours && self.ledger.files.iter().chain(&before).all(|(kept, _)| *kept != name) {
                 let _ = std::fs::remove_file(entry.path());
             }
         }

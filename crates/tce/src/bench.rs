@@ -4,7 +4,6 @@
 //! machine that others slow down shows it. FLOPs are those of the matrix products, two per multiply-add; what is not a
 //! product (activations, Adam, batches) counts as time but not as work.
 
-use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -20,10 +19,10 @@ use tce_diffusion::{
 use tce_learn::cvae::{CvaeConfig, CvaeLearner};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{
-    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, Learner, Member, Regulariser,
+    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, Regulariser,
     RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
-use tce_nn::{cpu, product_rate, tensor};
+use tce_nn::{Checkpoints, cpu, product_rate, tensor};
 use tce_sim::{CollectOptions, UniformActor, collect};
 
 use crate::error::Result;
@@ -181,7 +180,9 @@ fn learning<L: Learner + 'static>(lanes: Vec<(Buffer, L)>, flops: f64) -> Body {
         let mut lanes: Vec<_> =
             learners.iter_mut().zip(&buffers).map(|(learner, buffer)| Lane { learner, buffer }).collect();
         let steps = Steps { from, to: from + 10, report_every: 0 };
-        let done = train_side_by_side(&mut lanes, steps, "bench", &cpu(), |_, _, _| Ok::<_, Infallible>(()));
+        let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &cpu(), |_, _, _| {
+            Ok::<_, LearnError>(())
+        });
         done.expect("nothing to fail");
         from += 10;
     })
@@ -283,7 +284,7 @@ fn score_train() -> Body {
     let mut steps = 0;
     Body::new("updates", 10.0, 2.0 * batch * (3.0 * score_products(&spec).0 - inputs), move || {
         steps += 10;
-        trainer.train(std::slice::from_ref(&data), steps, |_, _| {}).expect("finite rows");
+        trainer.train(std::slice::from_ref(&data), steps, &mut Checkpoints::none(), |_, _| {}).expect("finite rows");
     })
 }
 
@@ -311,7 +312,7 @@ fn sample() -> Body {
     let labels = uniform_labels(&Streams::new(0), "y", rows, 0.2);
     let flops = 2.0 * score_products(&spec).1 * sampler.evaluations() as f64;
     Body::new("rows", rows as f64, flops, move || {
-        let request = Request { name: "bench", rows, condition: &labels, start: None };
+        let request = Request { name: "bench", rows, condition: &labels, start: None, kept: None };
         drop(model.sample(request, &sampler, &[Streams::new(0)], None).expect("a good request"));
     })
 }

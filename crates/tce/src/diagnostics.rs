@@ -115,9 +115,9 @@ pub fn quality(
     let units = &generator.units;
     let d = units.live.len();
     let started = std::time::Instant::now();
-    let states = generator.sample_states(rows, 0.0, sampler, &members, training)?;
+    let states = generator.sample_states(rows, 0.0, sampler, &members, training, None)?;
     let seconds = started.elapsed().as_secs_f64();
-    let successors = generator.sample_successors(&states, sampler, &members, training)?;
+    let successors = generator.sample_successors(&states, sampler, &members, training, None)?;
     let scale = Standardizer::fit(&units.take(&training.observations), d);
     let generated = scale.apply(&states);
     let real = |t: &Transitions| scale.apply(&units.take(&t.observations));
@@ -129,8 +129,8 @@ pub fn quality(
     let step = step_std(training, &units.live);
     let pair = (units.put_back(&states), units.put_back(&successors));
     let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-    let expanded_states = generator.sample_states(rows, config.y_max, sampler, &members, training)?;
-    let expanded_successors = generator.sample_successors(&expanded_states, sampler, &members, training)?;
+    let expanded_states = generator.sample_states(rows, config.y_max, sampler, &members, training, None)?;
+    let expanded_successors = generator.sample_successors(&expanded_states, sampler, &members, training, None)?;
     let expanded = finisher.finish(&[(&expanded_states, &expanded_successors)])?.remove(0).transitions;
     Ok(Quality {
         evaluations: sampler.evaluations(),

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{Agent, LoadOptions, Rows, Standardizer, Transitions, load, save_d4rl, zscore_keep};
+use tce_diffusion::Chunks;
 use tce_learn::{LabelConfig, LabelErrors, LabelModels, Labelled, Learner, Member, TerminalHandling, train_labels};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::terminal_rule;
@@ -71,10 +72,12 @@ pub fn label_models(
         models.restore(&NamedParameters::load(&path)?, &path)?;
         return Ok((models, stage, errors));
     }
-    let models = train_labels(&members, &labels, device)?.ok_or(Error::Interrupted)?;
+    let attempt = stage.attempt()?;
+    let models = train_labels(&members, &labels, &mut attempt.checkpoints("labels")?, device)?;
+    let models = models.ok_or(Error::Interrupted)?;
     let errors = models.errors();
-    models.state().save(&path)?;
-    stage.finish(&[file.to_owned()], &errors)?;
+    models.state().save(&attempt.file(file))?;
+    attempt.finish(&[file.to_owned()], &errors)?;
     Ok((models, stage, errors))
 }
 
@@ -193,9 +196,11 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
             (reports, tables)
         }
         None => {
+            let attempt = stage.attempt()?;
             let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
             let target = &inputs.target.rows;
-            let (states, successors) = generator.sample_pairs(rows, &config.generator, &members, target)?;
+            let kept = Chunks { directory: attempt.directory(), key: attempt.key() };
+            let (states, successors) = generator.sample_pairs(rows, &config.generator, &members, target, Some(kept))?;
             let finisher = Finisher::new(&generator.units, &models, config, inputs);
             let per_member = rows * generator.units.live.len();
             let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
@@ -209,7 +214,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
                     ("spec".to_owned(), serde_json::to_string(&spec).expect("plain data")),
                     ("seed".to_owned(), seed.to_string()),
                 ]);
-                save_d4rl(&stage.file(&file), &table, &attributes, &[])?;
+                save_d4rl(&attempt.file(&file), &table, &attributes, &[])?;
                 let terminals = table.terminals.iter().filter(|t| **t).count();
                 reports.push(Generated {
                     file,
@@ -223,7 +228,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
                 tables.push(Arc::new(table));
             }
             let files: Vec<_> = reports.iter().map(|r| r.file.clone()).collect();
-            stage.finish(&files, &reports)?;
+            attempt.finish(&files, &reports)?;
             (reports, tables)
         }
     };

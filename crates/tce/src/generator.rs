@@ -10,16 +10,16 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams};
 use tce_data::Transitions;
 use tce_diffusion::{
-    Condition, DiffusionError, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target, TrainConfig, Trainer,
-    uniform_labels,
+    Chunks, Condition, DiffusionError, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target,
+    TrainConfig, Trainer, uniform_labels,
 };
-use tce_nn::Device;
+use tce_nn::{Checkpoints, Device};
 
 use crate::config::GeneratorConfig;
 use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::metrics::Metrics;
-use crate::stage::Stage;
+use crate::stage::{Attempt, Stage};
 use crate::units::Units;
 
 /// Trained score networks and label models of a whole population, with the maps between their units and the data's.
@@ -98,12 +98,12 @@ impl Generator {
             return Ok((generator, stage, trained));
         }
         let started = std::time::Instant::now();
-        let mut metrics = Metrics::start(stage.directory())?;
-        let (generator, mut trained) = Self::train_now(inputs, config, seeds, device, &mut metrics)?;
+        let attempt = stage.attempt()?;
+        let (generator, mut trained) = Self::train_now(inputs, config, seeds, device, &attempt)?;
         trained.seconds = started.elapsed().as_secs_f64();
-        generator.state.save(&stage.file(files[0]))?;
-        generator.transition.save(&stage.file(files[1]))?;
-        stage.finish(&files.map(String::from), &trained)?;
+        generator.state.save(&attempt.file(files[0]))?;
+        generator.transition.save(&attempt.file(files[1]))?;
+        attempt.finish(&files.map(String::from), &trained)?;
         Ok((generator, stage, trained))
     }
 
@@ -112,7 +112,7 @@ impl Generator {
         config: &GeneratorConfig,
         seeds: &[u64],
         device: &Device,
-        metrics: &mut Metrics,
+        attempt: &Attempt,
     ) -> Result<(Self, Trained)> {
         let g = config;
         let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
@@ -139,9 +139,17 @@ impl Generator {
         let mut state = Trainer::new("state", NetworkConfig::new(d, 1), g.process, train, &members, device)?;
         let mut transition = Trainer::new("transition", NetworkConfig::new(d, d), g.process, train, &members, device)?;
         transition.stop_with(&state);
-        let metrics = Mutex::new(metrics);
-        let mut state_run = || run(&mut state, &state_data, g.state_steps, &metrics, "state");
-        let mut transition_run = || run(&mut transition, &transition_data, g.transition_steps, &metrics, "transition");
+        let (mut kept_state, mut kept_transition) = (attempt.checkpoints("state")?, attempt.checkpoints("transition")?);
+        let (state_step, transition_step) = (kept_state.step().unwrap_or(0), kept_transition.step().unwrap_or(0));
+        let metrics = Mutex::new(attempt.metrics(|stage, at| match stage {
+            "state" => at <= state_step,
+            _ => at <= transition_step,
+        })?);
+        let mut state_run = || run(&mut state, &state_data, g.state_steps, &mut kept_state, &metrics, "state");
+        let mut transition_run = || {
+            let steps = g.transition_steps;
+            run(&mut transition, &transition_data, steps, &mut kept_transition, &metrics, "transition")
+        };
         let (state_loss, transition_loss) = if rayon::current_num_threads() > 1 {
             std::thread::scope(|scope| {
                 let other = scope.spawn(transition_run);
@@ -170,11 +178,12 @@ impl Generator {
         sampler: &Sampler,
         members: &[Streams],
         target: &Transitions,
+        kept: Option<Chunks>,
     ) -> Result<Vec<f32>> {
         let labels: Vec<f32> = members.iter().flat_map(|m| uniform_labels(m, "state", rows, y_max)).collect();
         let start = self.start_rows(|| self.units.states(&target.observations), rows, members, "state");
         let progress = progress("sample states", rows * members.len(), sampler);
-        let request = Request { name: "state", rows, condition: &labels, start: start.as_deref() };
+        let request = Request { name: "state", rows, condition: &labels, start: start.as_deref(), kept };
         let mut states = self.state.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.state.invert_in_place(&mut states);
@@ -188,6 +197,7 @@ impl Generator {
         sampler: &Sampler,
         members: &[Streams],
         target: &Transitions,
+        kept: Option<Chunks>,
     ) -> Result<Vec<f32>> {
         let d = self.units.live.len();
         let rows = states.len() / (d * members.len());
@@ -198,7 +208,7 @@ impl Generator {
         };
         let start = self.start_rows(outputs, rows, members, "successor");
         let progress = progress("sample successors", rows * members.len(), sampler);
-        let request = Request { name: "successor", rows, condition: &condition, start: start.as_deref() };
+        let request = Request { name: "successor", rows, condition: &condition, start: start.as_deref(), kept };
         let mut out = self.transition.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.output.invert_in_place(&mut out);
@@ -239,9 +249,10 @@ impl Generator {
         config: &GeneratorConfig,
         members: &[Streams],
         target: &Transitions,
+        kept: Option<Chunks>,
     ) -> Result<(Vec<f32>, Vec<f32>)> {
-        let states = self.sample_states(rows, config.y_max, &config.sampler, members, target)?;
-        let successors = self.sample_successors(&states, &config.sampler, members, target)?;
+        let states = self.sample_states(rows, config.y_max, &config.sampler, members, target, kept)?;
+        let successors = self.sample_successors(&states, &config.sampler, members, target, kept)?;
         Ok((states, successors))
     }
 }
@@ -254,11 +265,12 @@ fn run(
     trainer: &mut Trainer,
     data: &ScoreData,
     steps: u64,
-    metrics: &Mutex<&mut Metrics>,
+    checkpoints: &mut Checkpoints,
+    metrics: &Mutex<Metrics>,
     name: &str,
 ) -> Result<Vec<f32>> {
     let mut last = Vec::new();
-    trainer.train(std::slice::from_ref(data), steps, |step, losses| {
+    trainer.train(std::slice::from_ref(data), steps, checkpoints, |step, losses| {
         last = losses.to_vec();
         if step % 500 == 0 || step == steps {
             let mut metrics = metrics.lock().unwrap_or_else(PoisonError::into_inner);

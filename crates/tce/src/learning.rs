@@ -1,6 +1,7 @@
 //! From data to policies: standardisation, the learner, its metrics, and the evaluation of every member.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -11,7 +12,7 @@ use tce_learn::{
     Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
     return_range_scale, train_side_by_side,
 };
-use tce_nn::{Device, is_cpu};
+use tce_nn::{Checkpoints, Device, is_cpu};
 use tce_sim::SimError;
 
 use crate::actors::{Evaluation, evaluate};
@@ -44,6 +45,15 @@ pub struct Arena {
     pub reference: Option<ReferenceScores>,
 }
 
+/// Where metrics and checkpoints are kept, and what tells this learning from others.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'a> {
+    /// The directory.
+    pub directory: &'a Path,
+    /// A word that stands for all that decides the result.
+    pub key: &'a str,
+}
+
 /// What learning leaves behind besides the policies.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
@@ -70,7 +80,7 @@ pub fn learn(
     config: &LearnerConfig,
     evaluation: &EvaluationConfig,
     arena: Option<Arena>,
-    metrics: &mut Metrics,
+    place: Place<'_>,
     device: &Device,
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<Learned> {
@@ -86,8 +96,13 @@ pub fn learn(
     let label = format!("learn {} {seeds:?}", label(config.algorithm));
     let mut learned = Learned::default();
     let due = |step: u64| step < config.steps && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
-    let mut judged = vec![0; lanes.len()];
-    let outcome = train_side_by_side(&mut lanes, steps, &label, device, |k, report, learner| {
+    let mut checkpoints = Checkpoints::open(place.directory, "learner", place.key)?;
+    let from = checkpoints.step().unwrap_or(0);
+    let metrics = &mut Metrics::resume(place.directory, |_, at| at <= from)?;
+    // The number of the last evaluation, which came with the last report.
+    let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
+    let mut judged = vec![number(from - from % steps.report_every); lanes.len()];
+    let outcome = train_side_by_side(&mut lanes, steps, &label, &mut checkpoints, device, |k, report, learner| {
         for (m, _) in seeds.iter().enumerate().skip(k * size).take(size) {
             let figures = report.metrics.iter().map(|(name, v)| (name.as_str(), v[m - k * size]));
             metrics.log("learn", report.step, m, figures)?;
@@ -98,7 +113,7 @@ pub fn learn(
                 *figure = value.is_finite().then_some(*value);
             }
         }
-        let number = report.step.checked_div(evaluation.every).unwrap_or(0);
+        let number = number(report.step);
         if let (Some(arena), true) = (arena, due(report.step) && number > judged[k]) {
             judged[k] = number;
             let evaluations = judge(&learner.policies(), &seeds[k * size..], evaluation.episodes, arena)?;
@@ -120,6 +135,7 @@ pub fn learn(
         }
     }
     learned.seconds = started.elapsed().as_secs_f64();
+    checkpoints.remove();
     Ok(learned)
 }
 

@@ -5,7 +5,8 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use serde_json::{Map, Value, json};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use tce_base::FileError;
 
 /// The metrics of one stage, written line by line: what a killed run had is there to be looked at.
@@ -17,12 +18,22 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Starts `metrics.jsonl` and `tensorboard/` in `directory` anew: a stage that was interrupted is done again from its
-    /// beginning, and so are its metrics.
-    pub fn start(directory: &Path) -> Result<Self, FileError> {
+    /// Starts `metrics.jsonl` and `tensorboard/` in `directory`, or goes on with what is there, without the lines for
+    /// whose stage and step `keep` is false: a killed program may have written more than its checkpoint knows.
+    pub fn resume(directory: &Path, keep: impl Fn(&str, u64) -> bool) -> Result<Self, FileError> {
         fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let path = directory.join("metrics.jsonl");
-        let file = File::create(&path).map_err(|e| FileError::new(&path, "create", e))?;
+        let old = match fs::read(&path) {
+            Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
+            Err(e) => return Err(FileError::new(&path, "read", e)),
+        };
+        // The last line may be half written.
+        let lines = old.lines().filter_map(|line| Some((line, serde_json::from_str::<Line>(line).ok()?)));
+        let kept: Vec<_> = lines.filter(|(_, line)| keep(&line.stage, line.step)).collect();
+        let text: String = kept.iter().map(|(line, _)| format!("{line}\n")).collect();
+        tce_base::write_atomically(&path, text.as_bytes())?;
+        let file = OpenOptions::new().append(true).open(&path).map_err(|e| FileError::new(&path, "open", e))?;
         let events_root = directory.join("tensorboard");
         match fs::remove_dir_all(&events_root) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
@@ -30,29 +41,10 @@ impl Metrics {
             }
             _ => {}
         }
-        Ok(Self { path, lines: BufWriter::new(file), events_root, events: Vec::new() })
-    }
-
-    /// Goes on with what is in `directory`, cut back to the first `step` steps: a killed program may have written more than its
-    /// checkpoint knows.
-    pub fn resume(directory: &Path, step: u64) -> Result<Self, FileError> {
-        let path = directory.join("metrics.jsonl");
-        let old = match fs::read_to_string(&path) {
-            Ok(text) => text,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
-            Err(e) => return Err(FileError::new(&path, "read", e)),
-        };
-        let mut metrics = Self::start(directory)?;
-        // The last line may be half written.
-        for line in old.lines().filter_map(|line| serde_json::from_str::<Map<String, Value>>(line).ok()) {
-            let number = |name: &str| line.get(name).and_then(Value::as_u64);
-            let (Some(at), Some(member)) = (number("step"), number("member")) else { continue };
-            let stage = line.get("stage").and_then(Value::as_str).unwrap_or_default();
-            let figures = line.iter().filter(|(name, _)| !matches!(name.as_str(), "step" | "member" | "stage"));
-            let figures = figures.map(|(name, value)| (name.as_str(), value.as_f64().unwrap_or(f64::NAN)));
-            if at <= step {
-                metrics.log(stage, at, member as usize, figures)?;
-            }
+        let mut metrics = Self { path, lines: BufWriter::new(file), events_root, events: Vec::new() };
+        for (_, line) in kept {
+            let values = line.values.iter().map(|(name, v)| (name.as_str(), v.as_f64().unwrap_or(f64::NAN)));
+            metrics.scalars(&line.stage, line.step, line.member, &values.collect::<Vec<_>>())?;
         }
         Ok(metrics)
     }
@@ -66,19 +58,31 @@ impl Metrics {
         values: impl IntoIterator<Item = (&'a str, f64)>,
     ) -> Result<(), FileError> {
         let values: Vec<_> = values.into_iter().collect();
-        let mut line = Map::new();
-        line.insert("stage".into(), json!(stage));
-        line.insert("step".into(), json!(step));
-        line.insert("member".into(), json!(member));
-        line.extend(values.iter().map(|&(name, value)| (name.to_owned(), Value::from(value))));
+        let map = values.iter().map(|&(name, value)| (name.to_owned(), Value::from(value))).collect();
+        let line = Line { stage: stage.into(), step, member, values: map };
         let failed = |e| FileError::new(&self.path, "write", e);
-        writeln!(self.lines, "{}", Value::Object(line)).and_then(|()| self.lines.flush()).map_err(failed)?;
+        let text = serde_json::to_value(&line).expect("plain data");
+        writeln!(self.lines, "{text}").and_then(|()| self.lines.flush()).map_err(failed)?;
+        self.scalars(stage, step, member, &values)
+    }
+
+    fn scalars(&mut self, stage: &str, step: u64, member: usize, values: &[(&str, f64)]) -> Result<(), FileError> {
         while self.events.len() <= member {
             let directory = self.events_root.join(format!("member-{}", self.events.len()));
             self.events.push(Events::create(&directory)?);
         }
         self.events[member].scalars(step, values.iter().map(|&(name, value)| (format!("{stage}/{name}"), value)))
     }
+}
+
+/// One line of `metrics.jsonl`.
+#[derive(Serialize, Deserialize)]
+struct Line {
+    stage: String,
+    step: u64,
+    member: usize,
+    #[serde(flatten)]
+    values: Map<String, Value>,
 }
 
 /// A TensorBoard event file: TFRecord frames around `Event` protocol buffers, of which scalars need five fields.
@@ -160,6 +164,8 @@ fn field_fixed64(out: &mut Vec<u8>, number: u8, bytes: [u8; 8]) {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -174,9 +180,27 @@ mod tests {
     }
 
     #[test]
+    fn what_comes_again_is_cut_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut metrics = Metrics::resume(dir.path(), |_, _| false).unwrap();
+        for step in [10, 20, 30] {
+            metrics.log("learn", step, 0, [("loss", if step == 10 { f64::NAN } else { 0.1 })]).unwrap();
+        }
+        drop(metrics);
+        let path = dir.path().join("metrics.jsonl");
+        let undisturbed = fs::read(&path).unwrap();
+        fs::write(&path, [&undisturbed[..], b"{\"stage\":\"le"].concat()).unwrap();
+        let mut metrics = Metrics::resume(dir.path(), |stage, step| stage == "learn" && step <= 10).unwrap();
+        for step in [20, 30] {
+            metrics.log("learn", step, 0, [("loss", 0.1)]).unwrap();
+        }
+        assert_eq!(fs::read(&path).unwrap(), undisturbed);
+    }
+
+    #[test]
     fn lines_are_json_and_events_are_written() {
         let dir = tempfile::tempdir().unwrap();
-        let mut metrics = Metrics::start(dir.path()).unwrap();
+        let mut metrics = Metrics::resume(dir.path(), |_, _| false).unwrap();
         metrics.log("learn", 10, 1, [("loss", 0.5), ("score", 61.7)]).unwrap();
         let text = fs::read_to_string(dir.path().join("metrics.jsonl")).unwrap();
         let line: Value = serde_json::from_str(text.trim()).unwrap();

@@ -118,8 +118,9 @@ pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f
     };
     let mut out = NamedParameters::default();
     out.tensors.insert("distances".into(), (vec![values.len()], values.clone()));
-    out.save(&file)?;
-    stage.finish(&["distances.safetensors".into()], values.len())?;
+    let attempt = stage.attempt()?;
+    out.save(&attempt.file("distances.safetensors"))?;
+    attempt.finish(&["distances.safetensors".into()], values.len())?;
     Ok(values)
 }
 

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use tce_base::write_atomically;
+use tce_base::{write_atomically, write_json};
 use tce_nn::Device;
 
+use crate::actors::Evaluation;
 use crate::config::{Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows};
 use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
-use crate::learning::{Arena, Learned, MemberData, learn};
-use crate::metrics::Metrics;
+use crate::learning::{Arena, Learned, MemberData, Place, learn};
 use crate::mixture::extra_rows;
 use crate::stage::Stage;
 
@@ -49,6 +49,14 @@ struct RunSpec<'a> {
     generator: Option<&'a GeneratorConfig>,
     filter: Option<&'a FilterConfig>,
     labels: Option<&'a LabelsConfig>,
+}
+
+/// What a run says about its policies: `result.json`.
+#[derive(Serialize)]
+struct Outcome<'a> {
+    seeds: &'a [u64],
+    scores: &'a [Option<f64>],
+    evaluations: &'a [Evaluation],
 }
 
 impl Config {
@@ -88,7 +96,8 @@ pub fn run(
     }
     let started = Instant::now();
     eprintln!("{name}: {}", stage.directory().display());
-    write_atomically(&stage.file("config.toml"), config.to_toml().as_bytes())?;
+    let attempt = stage.attempt()?;
+    write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
     let mut files = vec!["config.toml".to_owned()];
 
     let mut reports = Vec::new();
@@ -96,7 +105,7 @@ pub fn run(
     if generated {
         let expansion = expand(inputs, config, seeds, root, device)?;
         for report in &expansion.reports {
-            stage.link(&expansion.stage.file(&report.file), &report.file)?;
+            attempt.link(&expansion.stage.file(&report.file), &report.file)?;
             files.push(report.file.clone());
         }
         reports = expansion.reports;
@@ -127,11 +136,11 @@ pub fn run(
     };
     let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
     drop(extra);
-    let mut metrics = Metrics::start(stage.directory())?;
-    let learned = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, device, |policies| {
+    let place = Place { directory: attempt.directory(), key: attempt.key() };
+    let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         for (policy, seed) in policies.iter().zip(seeds) {
             let file = format!("policy-seed{seed}.safetensors");
-            policy.save(&stage.file(&file))?;
+            policy.save(&attempt.file(&file))?;
             files.push(file);
         }
         Ok(())
@@ -146,7 +155,14 @@ pub fn run(
         seconds: started.elapsed().as_secs_f64(),
         directory: stage.directory().to_owned(),
     };
-    stage.finish(&files, &summary)?;
+    // Without times, so that two copies of a run have the same bytes.
+    let result = "result.json".to_owned();
+    write_json(
+        &attempt.file(&result),
+        &Outcome { seeds, scores: &summary.scores, evaluations: &summary.learned.evaluations },
+    )?;
+    files.push(result);
+    attempt.finish(&files, &summary)?;
     Ok(summary)
 }
 

@@ -38,11 +38,18 @@ fn a_training_in_two_pieces_ends_with_the_bytes_of_one_in_one_piece() {
     let place = dir.path().join("whole/hopper-source-seed0");
     let replay = load(&place.join("medium-replay.hdf5"), &LoadOptions::default()).unwrap().transitions;
     assert_eq!(replay.len() as u64, whole[0]["step"].as_u64().unwrap());
-    // Every checkpoint but the last is gone.
+    // Every checkpoint but the last two is gone.
     let kept = fs::read_dir(&place)
         .unwrap()
         .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("replay-"));
-    assert_eq!(kept.count(), 1);
+    assert_eq!(kept.count(), 2);
+    // With the last one damaged the training goes on from the one before.
+    let newest = whole[0]["files"][0][0].as_str().unwrap();
+    fs::write(place.join(newest), b"damaged").unwrap();
+    let again = train("whole", "400", "1");
+    for key in ["step", "episode", "evaluations", "snapshots", "files"] {
+        assert_eq!(whole[0][key], again[0][key], "{key} after damage");
+    }
 
     // The policy is one like any other.
     let policy = place.join("policy.safetensors");

@@ -3,7 +3,7 @@ use crate::{Condition, Edm, Part, Ve, Vp};
 use std::collections::BTreeMap;
 use tce_nn::burn::module::{ModuleVisitor, Param};
 use tce_nn::burn::tensor::Gradients;
-use tce_nn::cpu;
+use tce_nn::{Checkpoints, cpu};
 
 fn small() -> NetworkConfig {
     NetworkConfig { width: 32, embedding: 16, blocks: 2, ..NetworkConfig::new(3, 2) }
@@ -83,14 +83,14 @@ fn a_restored_training_continues_to_the_byte() {
     let fresh = || Trainer::new("t", small(), Process::Vp(Vp::default()), config, &members, &cpu()).unwrap();
     let mut straight = fresh();
     let mut losses = Vec::new();
-    straight.train(&data, 120, |step, l| losses.push((step, l.to_vec()))).unwrap();
+    straight.train(&data, 120, &mut Checkpoints::none(), |step, l| losses.push((step, l.to_vec()))).unwrap();
     assert_eq!(losses.iter().map(|(s, l)| (*s, l.len())).collect::<Vec<_>>(), [(100, 2), (120, 2)]);
     let mut first = fresh();
-    first.train(&data, 70, |_, _| {}).unwrap();
+    first.train(&data, 70, &mut Checkpoints::none(), |_, _| {}).unwrap();
     let state = NamedParameters::from_bytes(&first.state().to_bytes(), Path::new("s")).unwrap();
     let mut second = fresh();
     second.restore(&state, Path::new("s")).unwrap();
-    second.train(&data, 120, |_, _| {}).unwrap();
+    second.train(&data, 120, &mut Checkpoints::none(), |_, _| {}).unwrap();
     assert_eq!(values(&straight), values(&second));
     let error = fresh().restore(&NamedParameters::default(), Path::new("s")).unwrap_err().to_string();
     assert!(error.contains("no 'step'"), "{error}");
@@ -104,7 +104,7 @@ fn members_learn_as_they_would_alone() {
     let run = |members: &[Streams]| {
         let process = Process::Edm(Edm::default());
         let mut trainer = Trainer::new("t", small(), process, config, members, &cpu()).unwrap();
-        trainer.train(&data, 20, |_, _| {}).unwrap();
+        trainer.train(&data, 20, &mut Checkpoints::none(), |_, _| {}).unwrap();
         values(&trainer)
     };
     let (both, alone) = (run(&[Streams::new(1), Streams::new(2)]).member(1), run(&[Streams::new(2)]));
@@ -122,7 +122,11 @@ fn misfits_are_refused() {
     let data = [ScoreData::new(vec![part], 3, 1, true).unwrap()];
     let process = Process::Vp(Vp::default());
     let new = |config| Trainer::new("t", small(), process, config, &[Streams::new(1)], &cpu());
-    let error = new(TrainConfig::default()).unwrap().train(&data, 1, |_, _| {}).unwrap_err().to_string();
+    let error = new(TrainConfig::default())
+        .unwrap()
+        .train(&data, 1, &mut Checkpoints::none(), |_, _| {})
+        .unwrap_err()
+        .to_string();
     assert_eq!(error, "data of t: found rows of 3 under conditions of 1, expected rows of 3 under conditions of 2");
     let error = new(TrainConfig { ema: 1.0, ..TrainConfig::default() }).err().unwrap().to_string();
     assert_eq!(error, "train.ema: found 1, expected at least 0 and less than 1");

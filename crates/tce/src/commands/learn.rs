@@ -5,14 +5,14 @@ use std::sync::Arc;
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::{sha256_file, sha256_hex};
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, reference_scores};
 use tce_nn::cpu;
 
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
 use crate::layers::ConfigArgs;
-use crate::learning::{Arena, Learned, MemberData, learn};
-use crate::metrics::Metrics;
+use crate::learning::{Arena, Learned, MemberData, Place, learn};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
 use crate::task::parse_environment;
@@ -96,10 +96,15 @@ impl Learn {
             trajectories: vec![target.clone()],
         };
         let data = seeds.iter().map(member).collect();
-        let mut metrics = Metrics::start(&self.out)?;
+        let spec = serde_json::json!({
+            "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
+            "target": sha256_file(&self.target)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
+        });
+        let key = sha256_hex(spec.to_string().as_bytes());
+        let place = Place { directory: &self.out, key: &key };
         tce_base::write_atomically(&self.out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
-        let learned = learn(data, &config.learner, &config.evaluation, arena, &mut metrics, &cpu(), |policies| {
+        let learned = learn(data, &config.learner, &config.evaluation, arena, place, &cpu(), |policies| {
             for (policy, seed) in policies.iter().zip(&seeds) {
                 let file = self.out.join(format!("policy-seed{seed}.safetensors"));
                 policy.save(&file)?;

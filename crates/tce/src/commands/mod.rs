@@ -30,6 +30,9 @@ pub struct Cli {
     /// Threads to use (default: all cores). The results do not depend on it.
     #[arg(long, global = true, value_name = "N")]
     threads: Option<usize>,
+    /// Seconds between two checkpoints of a long stage. What a killed command loses, not what it computes, depends on it.
+    #[arg(long, global = true, value_name = "SECONDS", default_value_t = 60.0)]
+    save_every: f64,
     #[command(subcommand)]
     command: Command,
 }
@@ -74,6 +77,10 @@ impl Cli {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
             pool.map_err(|e| Error::Failed(format!("cannot start {threads} threads: {e}")))?;
         }
+        if self.save_every.is_nan() || self.save_every < 0.0 {
+            return Err(Error::Usage(format!("--save-every {}: expected a number of seconds", self.save_every)));
+        }
+        tce_nn::set_checkpoint_seconds(self.save_every);
         let output = Output { json: self.json };
         match self.command {
             Command::Run(args) => args.run(output),
