@@ -119,29 +119,9 @@ impl Inputs {
     /// source is looked at.
     pub fn of_task(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<Self> {
         let Task { agent, shift, .. } = task;
-        let (shared, cache) = (shared_folder(), args.out.join("data"));
-        let collected =
-            |recipe: Recipe, quality: Quality| recipe.cached(&cache, &format!("{agent}-{}-{quality}", recipe.shift));
-        let public = task.target_file(&shared);
-        let target = match &args.target {
-            Some(path) => path.clone(),
-            None if !args.from_zoo && public.exists() => public,
-            None => match zoo::cast(agent, shift)?.target(agent, shift, task.target, 0) {
-                Some(recipe) => collected(recipe, task.target)?,
-                None => return Err(missing(shift, task.target, agent, "--target")),
-            },
-        };
         let dims = Some(agent.dims());
-        let target = table(&target, dims)?;
-        let source: Option<PathBuf> = match (source_rows, &args.source) {
-            (None, _) => None,
-            (Some(_), Some(path)) => Some(path.clone()),
-            (Some(rows), None) => {
-                let recipe = d4rl_recipe(agent, task.source, rows, 0, args.from_zoo)?;
-                Some(collected(recipe, task.source)?)
-            }
-        };
-        let source = source.map(|s| table(&s, dims)).transpose()?;
+        let target = table(&target_file(task, args)?, dims)?;
+        let source = source_rows.map(|rows| table(&source_file(task, args, rows)?, dims)).transpose()?;
         Self { agent: Some(agent), shift: Some(shift), target, source }.checked()
     }
 
@@ -182,6 +162,38 @@ impl Inputs {
     pub fn reference(&self, table: ScoreTable) -> Option<ReferenceScores> {
         reference_scores(self.agent?, self.shift?, table)
     }
+}
+
+/// The target data of a task, collected now if it has to be; see [`Inputs::of_task`].
+///
+/// # Errors
+/// If the zoo lacks an actor, or the rows cannot be written.
+pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
+    let Task { agent, shift, target, .. } = task;
+    let public = task.target_file(&shared_folder());
+    match &args.target {
+        Some(path) => Ok(path.clone()),
+        None if !args.from_zoo && public.exists() => Ok(public),
+        None => {
+            let recipe = zoo::cast(agent, shift)?.target(agent, shift, target, 0);
+            collected(&recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?, target, args)
+        }
+    }
+}
+
+/// The source data of a task, of which `rows` is the size of a medium set, collected now if it has to be.
+///
+/// # Errors
+/// As for [`target_file`].
+pub fn source_file(task: Task, args: &DataArgs, rows: usize) -> Result<PathBuf> {
+    match &args.source {
+        Some(path) => Ok(path.clone()),
+        None => collected(&d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?, task.source, args),
+    }
+}
+
+fn collected(recipe: &Recipe, quality: Quality, args: &DataArgs) -> Result<PathBuf> {
+    recipe.cached(&args.out.join("data"), &format!("{}-{}-{quality}", recipe.agent, recipe.shift))
 }
 
 /// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo

@@ -18,6 +18,7 @@ mod output;
 mod pipeline;
 mod stage;
 mod stand_ins;
+mod sweep;
 mod task;
 mod units;
 mod variant;

@@ -286,9 +286,19 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
     all(from, to).inspect_err(|_| drop(fs::remove_dir_all(to)))
 }
 
+/// SHA-256 of the files of the finished stage in `directory`, as its `done.json` lists them.
+///
+/// # Errors
+/// If the stage is not done, or its record is damaged.
+pub fn files_of(directory: &Path) -> Result<BTreeMap<String, String>> {
+    let stage = Stage { directory: directory.to_owned(), key: String::new() };
+    let done = stage.done::<serde_json::Value>()?;
+    done.map(|d| d.files).ok_or_else(|| Error::missing(directory, "no done.json: the stage is not finished"))
+}
+
 /// The process that owns an attempt: machine, process and when that started, because numbers of processes come again.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Owner {
+pub struct Owner {
     machine: String,
     process: u32,
     started: u64,
@@ -301,7 +311,8 @@ impl std::fmt::Display for Owner {
 }
 
 impl Owner {
-    fn this() -> Self {
+    /// This process.
+    pub fn this() -> Self {
         let process = std::process::id();
         Self { machine: machine(), process, started: started(process).unwrap_or(0) }
     }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Quality, Shift};
 
 /// One transfer problem: an agent, how the target differs from the source, and the quality of both data sets.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Task {
     /// The robot.

@@ -16,6 +16,7 @@ mod diagnose;
 mod evaluate;
 mod learn;
 mod run;
+mod sweep;
 mod train_sac;
 mod zoo;
 
@@ -63,6 +64,9 @@ enum Command {
     /// Measure what a stage of the pipeline does.
     #[command(subcommand)]
     Diagnose(diagnose::Diagnose),
+    /// Many runs: planned once, done on one machine or on Slurm, gathered into a table.
+    #[command(subcommand)]
+    Sweep(sweep::SweepCommand),
     /// Measure how fast the program's hot loops run on this machine.
     Bench(bench::Bench),
 }
@@ -93,6 +97,7 @@ impl Cli {
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),
             Command::Diagnose(command) => command.run(output),
+            Command::Sweep(command) => command.run(output, self.save_every),
             Command::Bench(args) => args.run(output),
         }
     }

@@ -1,0 +1,303 @@
+//! `tce sweep plan`, `launch`, `run-one`, `status` and `gather`.
+
+use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Subcommand, ValueEnum};
+use serde::Serialize;
+use tce_base::interrupted;
+
+use crate::error::{Error, Result};
+use crate::output::{Output, table};
+use crate::sweep::local::Share;
+use crate::sweep::slurm::{Array, Submission};
+use crate::sweep::{Kind, Manifest, Sweep};
+
+/// The commands of `sweep`.
+#[derive(Debug, Subcommand)]
+pub enum SweepCommand {
+    /// Turn a description (tasks × variants × overrides × seeds) into a list of work that does not change any more.
+    Plan(Plan),
+    /// Do what is missing, on this machine or on Slurm. To be called again after any accident.
+    Launch(Launch),
+    /// Do pieces of work by their number in the manifest.
+    RunOne(RunOne),
+    /// What is done, who is at work, what failed, the scores so far.
+    Status(StatusArgs),
+    /// Verify everything that is done and make a table of it.
+    Gather(Gather),
+}
+
+/// Arguments of `sweep plan`.
+#[derive(Debug, Args)]
+pub struct Plan {
+    /// The description: TOML, see examples/sweep.toml.
+    description: PathBuf,
+    /// The sweep's folder (default: runs/sweeps/NAME).
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Only tell what would be planned.
+    #[arg(long)]
+    dry_run: bool,
+}
+
+/// Who does the work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Launcher {
+    /// Processes of this machine.
+    Local,
+    /// Array jobs.
+    Slurm,
+}
+
+/// Arguments of `sweep launch`.
+#[derive(Debug, Args)]
+pub struct Launch {
+    /// The sweep's folder.
+    directory: PathBuf,
+    /// Who does the work.
+    #[arg(long, value_enum, default_value = "local")]
+    launcher: Launcher,
+    /// local: processes at a time (default: one a core).
+    #[arg(long)]
+    workers: Option<usize>,
+    /// Threads of each process.
+    #[arg(long, default_value_t = 1)]
+    threads_each: usize,
+    /// local: how often work is tried again after a failure.
+    #[arg(long, default_value_t = 2)]
+    retries: usize,
+    /// slurm: pieces of work in one array element, one after the other; for work of less than a minute.
+    #[arg(long, default_value_t = 1)]
+    pack: usize,
+    /// slurm: seconds before the time limit at which the work writes its checkpoint and asks for another turn.
+    #[arg(long, default_value_t = 120)]
+    grace: u32,
+    /// slurm: an argument for sbatch, such as --sbatch=--time=04:00:00; may be given several times.
+    #[arg(long, value_name = "ARGUMENT", allow_hyphen_values = true)]
+    sbatch: Vec<String>,
+    /// Only tell what would be done.
+    #[arg(long)]
+    dry_run: bool,
+}
+
+/// Arguments of `sweep run-one`.
+#[derive(Debug, Args)]
+pub struct RunOne {
+    /// The sweep's folder.
+    directory: PathBuf,
+    /// Numbers of pieces of work.
+    #[arg(required = true)]
+    indices: Vec<usize>,
+}
+
+/// Arguments of `sweep status`.
+#[derive(Debug, Args)]
+pub struct StatusArgs {
+    /// The sweep's folder.
+    directory: PathBuf,
+    /// Show it again and again, until everything is done.
+    #[arg(long)]
+    watch: bool,
+    /// Seconds between two looks.
+    #[arg(long, default_value_t = 5.0)]
+    every: f64,
+}
+
+/// Arguments of `sweep gather`.
+#[derive(Debug, Args)]
+pub struct Gather {
+    /// The sweep's folder.
+    directory: PathBuf,
+    /// Make a table of what there is, although something is missing, corrupt or in conflict.
+    #[arg(long)]
+    partial: bool,
+}
+
+impl SweepCommand {
+    /// Runs the command.
+    pub fn run(self, output: Output, save_every: f64) -> Result<()> {
+        match self {
+            SweepCommand::Plan(args) => args.run(output),
+            SweepCommand::Launch(args) => args.run(output, save_every),
+            SweepCommand::RunOne(args) => args.run(output),
+            SweepCommand::Status(args) => args.run(output),
+            SweepCommand::Gather(args) => args.run(output),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct Planned {
+    directory: PathBuf,
+    source: usize,
+    target: usize,
+    expand: usize,
+    run: usize,
+}
+
+impl Plan {
+    fn run(self, output: Output) -> Result<()> {
+        let manifest = Manifest::plan(&self.description)?;
+        let directory = self.out.unwrap_or_else(|| PathBuf::from("runs/sweeps").join(&manifest.header.name));
+        let count = |kind| manifest.entries.iter().filter(|e| e.kind == kind).count();
+        let planned = Planned {
+            source: count(Kind::Source),
+            target: count(Kind::Target),
+            expand: count(Kind::Expand),
+            run: count(Kind::Run),
+            directory,
+        };
+        if !self.dry_run {
+            Sweep::create(&planned.directory, manifest)?;
+        }
+        output.print(&planned, |p| {
+            let rows =
+                [("source data", p.source), ("target data", p.target), ("generated rows", p.expand), ("runs", p.run)];
+            let text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
+            format!("{text}\n{}", p.directory.display())
+        });
+        Ok(())
+    }
+}
+
+#[derive(Serialize)]
+struct Submitted {
+    arrays: Vec<Array>,
+}
+
+impl Launch {
+    fn run(self, output: Output, save_every: f64) -> Result<()> {
+        if self.threads_each == 0 || self.workers == Some(0) || self.pack == 0 {
+            return Err(Error::Usage("--workers, --threads-each and --pack must be at least 1".into()));
+        }
+        let sweep = Sweep::open(&self.directory)?;
+        match self.launcher {
+            Launcher::Slurm => {
+                let arrays = sweep.launch_slurm(&Submission {
+                    pack: self.pack,
+                    threads: self.threads_each,
+                    save_every,
+                    grace: self.grace,
+                    arguments: self.sbatch,
+                    dry_run: self.dry_run,
+                })?;
+                output.print(&Submitted { arrays }, |s| {
+                    let rows = s.arrays.iter().map(|a| {
+                        let pieces: usize = a.elements.iter().map(Vec::len).sum();
+                        [
+                            a.job.clone().unwrap_or("-".into()),
+                            a.elements.len().to_string(),
+                            pieces.to_string(),
+                            a.command.join(" "),
+                        ]
+                    });
+                    table(&["job", "elements", "pieces of work", "command"], rows)
+                });
+                Ok(())
+            }
+            Launcher::Local if self.dry_run => {
+                let mut missing = Vec::new();
+                for entry in sweep.entries() {
+                    if sweep.outcome(entry)?.is_none() {
+                        missing.push(entry.to_string());
+                    }
+                }
+                output.print(&missing, |m| m.join("\n"));
+                Ok(())
+            }
+            Launcher::Local => {
+                let cores = std::thread::available_parallelism().map_or(1, usize::from);
+                let workers = self.workers.unwrap_or((cores / self.threads_each).max(1));
+                let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every };
+                let failed = sweep.launch_here(share)?;
+                let status = sweep.status()?;
+                output.print(&status, |s| s.render());
+                match failed {
+                    0 => Ok(()),
+                    n => Err(Error::Failed(format!(
+                        "{n} pieces of work failed; their messages are in {}/failed",
+                        self.directory.display()
+                    ))),
+                }
+            }
+        }
+    }
+}
+
+impl RunOne {
+    fn run(self, output: Output) -> Result<()> {
+        let sweep = Sweep::open(&self.directory)?;
+        let count = sweep.entries().len();
+        if let Some(index) = self.indices.iter().find(|i| **i >= count) {
+            return Err(Error::Usage(format!("{index}: the manifest has {count} pieces of work, numbered from 0")));
+        }
+        let mut outcomes = Vec::new();
+        let mut failed = None;
+        for &index in &self.indices {
+            match sweep.work(&sweep.entries()[index]) {
+                Ok(outcome) => outcomes.push(outcome),
+                // The work's own checkpoint is written; the rest of the list comes in the next turn.
+                Err(e) if e.exit_code() == 130 => return Err(e),
+                Err(e) => {
+                    eprintln!("{}: {e}", sweep.entries()[index]);
+                    failed = Some(e);
+                }
+            }
+        }
+        match failed {
+            Some(e) => Err(e),
+            None => {
+                output.print(&outcomes, |all| {
+                    let rows = all.iter().map(|o| {
+                        let score = o.score.map_or("-".into(), |s| format!("{s:.1}"));
+                        [o.id.clone(), score, format!("{:.0} s", o.seconds), o.place.display().to_string()]
+                    });
+                    table(&["work", "score", "time", "place"], rows)
+                });
+                Ok(())
+            }
+        }
+    }
+}
+
+impl StatusArgs {
+    fn run(self, output: Output) -> Result<()> {
+        let sweep = Sweep::open(&self.directory)?;
+        loop {
+            let status = sweep.status()?;
+            if !self.watch {
+                output.print(&status, |s| s.render());
+                return Ok(());
+            }
+            let mut out = std::io::stdout().lock();
+            // On a terminal the next look takes the place of the last one.
+            let clear = if out.is_terminal() { "\x1b[H\x1b[2J" } else { "" };
+            let _ = write!(out, "{clear}{}", status.render()).and_then(|()| out.flush());
+            drop(out);
+            if status.complete() {
+                return Ok(());
+            }
+            let until = std::time::Instant::now() + Duration::from_secs_f64(self.every.clamp(0.1, 3600.0));
+            while std::time::Instant::now() < until {
+                if interrupted() {
+                    return Err(Error::Interrupted);
+                }
+                std::thread::sleep(Duration::from_millis(50));
+            }
+        }
+    }
+}
+
+impl Gather {
+    fn run(self, output: Output) -> Result<()> {
+        let gathered = Sweep::open(&self.directory)?.gather()?;
+        if !self.partial {
+            gathered.whole()?;
+        }
+        tce_base::write_json(&self.directory.join("results.json"), &gathered)?;
+        output.print(&gathered, |g| g.render());
+        Ok(())
+    }
+}

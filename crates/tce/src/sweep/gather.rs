@@ -1,0 +1,149 @@
+//! From finished work to a table that can be trusted.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+
+use serde::Serialize;
+use tce_base::sha256_file;
+
+use super::work::Outcome;
+use super::{Entry, Kind, Sweep};
+use crate::error::{Error, Result};
+use crate::output::{plus_minus, table};
+
+/// One finished run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// The task.
+    pub task: String,
+    /// The method, with the override's name.
+    pub method: String,
+    /// The seed.
+    pub seed: u64,
+    /// Normalised score.
+    pub score: Option<f64>,
+    /// Where its policy is.
+    pub place: PathBuf,
+    /// Seconds.
+    pub seconds: f64,
+    /// The program that did it.
+    pub program: String,
+}
+
+/// All that is done, and what is wrong.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Gathered {
+    /// Finished runs, in the order of the manifest.
+    pub rows: Vec<Row>,
+    /// Runs that are not done.
+    pub missing: Vec<String>,
+    /// Runs whose files are not what they were.
+    pub corrupt: Vec<String>,
+    /// Results that came later and differ.
+    pub conflicts: Vec<PathBuf>,
+}
+
+impl Sweep {
+    /// Everything that is done, verified file by file.
+    ///
+    /// # Errors
+    /// If a folder cannot be read.
+    pub fn gather(&self) -> Result<Gathered> {
+        let mut out = Gathered::default();
+        for entry in self.entries().iter().filter(|e| e.kind == Kind::Run) {
+            match self.outcome(entry) {
+                Ok(None) => out.missing.push(entry.to_string()),
+                Ok(Some(outcome)) => match self.damage(entry, &outcome) {
+                    Some(what) => out.corrupt.push(format!("{entry}: {what}")),
+                    None => out.rows.push(Row {
+                        task: entry.task.to_string(),
+                        method: entry.column(),
+                        seed: entry.seed,
+                        score: outcome.score,
+                        place: outcome.place,
+                        seconds: outcome.seconds,
+                        program: outcome.program,
+                    }),
+                },
+                Err(e) => out.corrupt.push(format!("{entry}: {e}")),
+            }
+        }
+        let faults = fs::read_dir(self.directory.join("faults")).into_iter().flatten().flatten();
+        out.conflicts = faults.map(|f| f.path()).collect();
+        out.conflicts.sort();
+        Ok(out)
+    }
+
+    fn damage(&self, entry: &Entry, outcome: &Outcome) -> Option<String> {
+        if outcome.id != entry.id {
+            return Some(format!("found the outcome of {}, expected that of {}", outcome.id, entry.id));
+        }
+        outcome.files.iter().find_map(|(name, expected)| {
+            let file = self.directory.join(&outcome.place).join(name);
+            match sha256_file(&file) {
+                Ok(found) if found == *expected => None,
+                Ok(found) => Some(format!("{}: SHA-256 {found}, expected {expected}", file.display())),
+                Err(e) => Some(e.to_string()),
+            }
+        })
+    }
+}
+
+impl Gathered {
+    /// What keeps the table from being whole.
+    ///
+    /// # Errors
+    /// If there is anything, with a list of it.
+    pub fn whole(&self) -> Result<()> {
+        let lists: [(&str, Vec<String>); 3] = [
+            ("not done", self.missing.clone()),
+            ("corrupt", self.corrupt.clone()),
+            ("in conflict", self.conflicts.iter().map(|p| p.display().to_string()).collect()),
+        ];
+        if lists.iter().all(|(_, list)| list.is_empty()) {
+            return Ok(());
+        }
+        let mut text = String::from("the table would be partial; launch the sweep again, or say --partial\n");
+        for (what, list) in lists.iter().filter(|(_, list)| !list.is_empty()) {
+            text += &format!("{} {what}:\n", list.len());
+            text.extend(list.iter().take(20).map(|item| format!("  {item}\n")));
+            if list.len() > 20 {
+                text += "  ...\n";
+            }
+        }
+        Err(Error::Failed(text))
+    }
+
+    /// Tasks × methods: mean ± standard deviation over seeds.
+    pub fn render(&self) -> String {
+        let mut methods: Vec<&str> = Vec::new();
+        let mut tasks: Vec<&str> = Vec::new();
+        let mut cells: BTreeMap<(&str, &str), Vec<f64>> = BTreeMap::new();
+        for row in &self.rows {
+            if !methods.contains(&row.method.as_str()) {
+                methods.push(&row.method);
+            }
+            if !tasks.contains(&row.task.as_str()) {
+                tasks.push(&row.task);
+            }
+            cells.entry((&row.task, &row.method)).or_default().extend(row.score);
+        }
+        let header: Vec<&str> = std::iter::once("task").chain(methods.iter().copied()).collect();
+        let rows = tasks.iter().map(|task| {
+            let cell = |method: &&str| cells.get(&(*task, *method)).map_or("-".into(), |s| plus_minus(s));
+            std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect::<Vec<_>>()
+        });
+        let mut text = table(&header, rows);
+        let problems = self.missing.len() + self.corrupt.len() + self.conflicts.len();
+        if problems > 0 {
+            text += &format!(
+                "\nPARTIAL: {} runs not done, {} corrupt, {} in conflict",
+                self.missing.len(),
+                self.corrupt.len(),
+                self.conflicts.len()
+            );
+        }
+        text
+    }
+}

@@ -1,0 +1,234 @@
+//! A sweep on a cluster that runs Slurm: array jobs of what is missing.
+//!
+//! Job numbers are notes only, and `sacct` is not needed: a launch submits what is not done and, as far as `squeue` tells, not
+//! submitted already. Should the queue forget a job, or a node be given up for dead whose processes live on, another launch or a second
+//! copy of the work does no harm (see [`super::work`]).
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde::Serialize;
+use tce_base::{Streams, sha256_hex, write_atomically};
+
+use super::{Kind, Sweep};
+use crate::error::{Error, Result};
+use crate::stage::Owner;
+
+/// How to submit.
+#[derive(Clone, Debug)]
+pub struct Submission {
+    /// Pieces of work in one element of an array, one after the other: Slurm needs some seconds for each element.
+    pub pack: usize,
+    /// Threads of each element.
+    pub threads: usize,
+    /// Seconds between checkpoints.
+    pub save_every: f64,
+    /// Seconds before the time limit at which the work is warned and writes its checkpoint.
+    pub grace: u32,
+    /// Further arguments of `sbatch`: partition, time limit, memory, account.
+    pub arguments: Vec<String>,
+    /// Tell what would be submitted, and submit nothing.
+    pub dry_run: bool,
+}
+
+/// One array job.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Array {
+    /// The call.
+    pub command: Vec<String>,
+    /// Indices of the pieces of work of each element.
+    pub elements: Vec<Vec<usize>>,
+    /// The job's number, once it is submitted.
+    pub job: Option<String>,
+}
+
+/// The numbers that may be used for array elements, from Slurm's own configuration.
+fn max_array_size() -> Result<usize> {
+    let text = call("scontrol", &["show".into(), "config".into()])?;
+    let line = text.lines().find(|l| l.trim_start().starts_with("MaxArraySize"));
+    let size = line.and_then(|l| l.split('=').nth(1)).and_then(|v| v.trim().parse().ok());
+    size.filter(|&s: &usize| s > 0).ok_or_else(|| {
+        Error::Failed(
+            "`scontrol show config` tells no MaxArraySize; is this a machine that Slurm's jobs are submitted from?"
+                .into(),
+        )
+    })
+}
+
+fn call(program: &str, arguments: &[String]) -> Result<String> {
+    let output = Command::new(program).args(arguments).output();
+    let output = output.map_err(|e| {
+        Error::Failed(format!("{program}: {e}; Slurm's programs must be in PATH, or use --launcher local"))
+    })?;
+    if !output.status.success() {
+        let message = String::from_utf8_lossy(&output.stderr);
+        return Err(Error::Failed(format!("{program} {}: {}: {}", arguments.join(" "), output.status, message.trim())));
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// The batch script. It waits for the work instead of becoming it: of a batch script that is killed Slurm tells nothing but its
+/// death, and the warning before the time limit goes to the script alone.
+fn script(sweep: &Path, list: &Path, program: &Path, options: &Submission) -> String {
+    let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', r"'\''"));
+    format!(
+        r#"#!/bin/sh
+# Written by `tce sweep launch`. Element N of the array does the work in line N of the list.
+work=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" {list})
+{program} --threads {threads} --save-every {save_every} sweep run-one {sweep} $work &
+run=$!
+warned=0
+trap 'warned=1; kill -USR1 $run 2>/dev/null' USR1
+trap 'kill -TERM $run 2>/dev/null' TERM
+# A signal ends `wait`, not the work.
+wait $run
+code=$?
+while kill -0 $run 2>/dev/null; do
+  wait $run
+  code=$?
+done
+# Stopped at a checkpoint because the time limit is near: the rest in another turn.
+if [ "$warned" = 1 ] && [ "$code" = 130 ]; then
+  scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"
+fi
+exit $code
+"#,
+        list = quoted(list),
+        program = quoted(program),
+        sweep = quoted(sweep),
+        threads = options.threads,
+        save_every = options.save_every,
+    )
+}
+
+impl Sweep {
+    /// The name of this sweep's jobs.
+    pub fn job_name(&self) -> String {
+        let place = self.directory.canonicalize().unwrap_or_else(|_| self.directory.clone());
+        let safe: String =
+            self.manifest.header.name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+        format!("tce-{safe}-{}", &sha256_hex(place.display().to_string().as_bytes())[..8])
+    }
+
+    /// Submits what is missing; returns the arrays, one after the other.
+    ///
+    /// # Errors
+    /// If Slurm refuses; what was submitted before stays, and another launch submits the rest.
+    pub fn launch_slurm(&self, options: &Submission) -> Result<Vec<Array>> {
+        let limit = max_array_size()?;
+        let queued = match self.queued() {
+            Ok(queued) => queued,
+            Err(e) => {
+                eprintln!(
+                    "{e}; what is in the queue is not known, and may be submitted a second time, which is harmless"
+                );
+                BTreeSet::new()
+            }
+        };
+        let directory =
+            self.directory.canonicalize().map_err(|e| tce_base::FileError::new(&self.directory, "find", e))?;
+        let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
+        let folder = directory.join("slurm");
+        let mut arrays: Vec<Array> = Vec::new();
+        let mut before: Vec<String> = Vec::new();
+        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Expand], &[Kind::Run]] {
+            let mut missing = Vec::new();
+            for entry in self.entries().iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index)) {
+                if self.outcome(entry)?.is_none() {
+                    missing.push(entry.index);
+                }
+            }
+            let elements: Vec<Vec<usize>> = missing.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();
+            let mut jobs = Vec::new();
+            for elements in elements.chunks(limit) {
+                let stem = folder.join(unique());
+                let (list, file) = (stem.with_extension("list"), stem.with_extension("sh"));
+                let mut command: Vec<String> = vec![
+                    "sbatch".into(),
+                    "--parsable".into(),
+                    format!("--array=0-{}", elements.len() - 1),
+                    format!("--job-name={}", self.job_name()),
+                    "--requeue".into(),
+                    "--open-mode=append".into(),
+                    format!("--signal=B:USR1@{}", options.grace),
+                    format!("--cpus-per-task={}", options.threads),
+                    format!("--output={}", directory.join("logs/slurm-%A_%a.log").display()),
+                ];
+                if !before.is_empty() {
+                    // Whatever became of it: a run whose rows are missing makes them itself.
+                    command.push(format!("--dependency=afterany:{}", before.join(":")));
+                }
+                command.extend(options.arguments.iter().cloned());
+                command.push(file.display().to_string());
+                let job = match options.dry_run {
+                    true => None,
+                    false => {
+                        fs::create_dir_all(directory.join("logs"))
+                            .map_err(|e| tce_base::FileError::new(&directory, "create a directory in", e))?;
+                        let lines = elements.iter().fold(String::new(), |mut text, indices| {
+                            let words: Vec<_> = indices.iter().map(ToString::to_string).collect();
+                            let _ = writeln!(text, "{}", words.join(" "));
+                            text
+                        });
+                        write_atomically(&list, lines.as_bytes())?;
+                        write_atomically(&file, script(&directory, &list, &program, options).as_bytes())?;
+                        let answer = call("sbatch", &command[1..])?;
+                        let job = answer.trim().split(';').next().unwrap_or_default().to_owned();
+                        write_atomically(&stem.with_extension("job"), job.as_bytes())?;
+                        Some(job)
+                    }
+                };
+                jobs.extend(job.clone());
+                arrays.push(Array { command, elements: elements.to_vec(), job });
+            }
+            if options.dry_run && !elements.is_empty() {
+                jobs.push("JOB".into());
+            }
+            if !jobs.is_empty() {
+                before = jobs;
+            }
+        }
+        Ok(arrays)
+    }
+
+    /// Indices of the work that the queue knows.
+    fn queued(&self) -> Result<BTreeSet<usize>> {
+        let name = self.job_name();
+        let states = "PENDING,RUNNING,CONFIGURING,COMPLETING,SUSPENDED,REQUEUED,REQUEUE_HOLD,RESIZING,STOPPED";
+        let arguments = ["-h", "-r", "-t", states, "-n", &name, "-o", "%F|%K"].map(String::from);
+        let text = call("squeue", &arguments)?;
+        let folder = self.directory.join("slurm");
+        let mut lists: std::collections::BTreeMap<String, Vec<Vec<usize>>> = Default::default();
+        for path in fs::read_dir(&folder).into_iter().flatten().flatten().map(|e| e.path()) {
+            if path.extension().is_some_and(|e| e == "job") {
+                lists.insert(fs::read_to_string(&path).unwrap_or_default(), list(&path.with_extension("list")));
+            }
+        }
+        let mut out = BTreeSet::new();
+        for line in text.lines() {
+            let Some((job, element)) = line.trim().split_once('|') else { continue };
+            let elements = lists.get(job).zip(element.parse::<usize>().ok());
+            out.extend(elements.and_then(|(l, k)| l.get(k)).into_iter().flatten().copied());
+        }
+        Ok(out)
+    }
+}
+
+fn list(path: &Path) -> Vec<Vec<usize>> {
+    let text = fs::read_to_string(path).unwrap_or_default();
+    text.lines().map(|line| line.split(' ').filter_map(|word| word.parse().ok()).collect()).collect()
+}
+
+/// A name that no other submission has.
+fn unique() -> PathBuf {
+    use rand::RngExt;
+    use std::sync::atomic::{AtomicU64, Ordering};
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let owner = Owner::this().to_string();
+    let n = COUNT.fetch_add(1, Ordering::Relaxed);
+    let mark: u32 = Streams::new(super::work::now()).stream(&owner).random();
+    PathBuf::from(format!("{}-{n}-{mark:08x}", super::work::now()))
+}
