@@ -334,12 +334,15 @@ impl Owner {
     }
 }
 
-/// The machine's name and the id of its present boot: after a restart, numbers of processes begin anew.
+/// The machine's name, the id of its present boot and the name space of processes: after a restart, and in every container, numbers of
+/// processes begin anew.
 fn machine() -> String {
     let read = |path: &str| fs::read_to_string(path).unwrap_or_default().trim().to_owned();
     let name = read("/proc/sys/kernel/hostname").replace(['.', '/'], "-");
     let boot = read("/proc/sys/kernel/random/boot_id");
-    format!("{name}-{}", boot.get(..8).unwrap_or("unknown"))
+    let space = fs::read_link("/proc/self/ns/pid").unwrap_or_default();
+    let space: String = space.to_string_lossy().chars().filter(char::is_ascii_digit).collect();
+    format!("{name}-{}-{space}", boot.get(..8).unwrap_or("unknown"))
 }
 
 /// When a process of this machine began, in ticks since the boot; none if there is no such process.

@@ -2,7 +2,6 @@
 
 mod common;
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
@@ -10,53 +9,10 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
+use common::sweeps::{SETS, describe, outcomes};
 use common::{tce, tce_json};
 use rand::RngExt;
-use serde_json::Value;
 use tce_base::Streams;
-
-const SETS: &[&str] = &[
-    "source.rows=1500",
-    "generator.state_steps=100",
-    "generator.transition_steps=100",
-    "generator.batch=32",
-    "generator.rows=600",
-    "generator.sampler.steps=4",
-    "labels.training.steps=60",
-    "labels.training.batch=32",
-    "learner.steps=120",
-    "learner.behaviour.cvae.steps=30",
-    "learner.behaviour.cvae.hidden=[16]",
-    "learner.batch=32",
-    "evaluation.episodes=1",
-];
-
-fn describe(directory: &Path, name: &str, seeds: u64) -> String {
-    let sets: Vec<String> = SETS.iter().map(|s| format!("{s:?}")).collect();
-    let file = format!("{name}.toml");
-    let text = format!(
-        "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"tce-og\", \"tce-no-reg\", \"bc\"]\nfloors = false\n\
-         seeds = {seeds}\nset = [{}]\nfrom_zoo = true\n",
-        sets.join(", ")
-    );
-    fs::write(directory.join(&file), text).unwrap();
-    file
-}
-
-/// What the records in `done/` say, without times.
-fn outcomes(sweep: &Path) -> BTreeMap<String, Value> {
-    let mut out = BTreeMap::new();
-    for path in fs::read_dir(sweep.join("done")).unwrap().map(|e| e.unwrap().path()) {
-        let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-        if name.starts_with('.') {
-            continue;
-        }
-        let mut value: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
-        value.as_object_mut().unwrap().remove("seconds");
-        out.insert(name, value);
-    }
-    out
-}
 
 fn message(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ")
@@ -259,7 +215,7 @@ fn slurm_gets_what_is_missing_in_arrays_that_it_accepts() {
     assert!(calls[3].contains("--dependency=afterany:2 "));
 
     // What the queue knows is not submitted again.
-    fs::write(dir.path().join("queue"), "1|0\n2|0\n2|1\n3|0\n3|1\n3|2\n4|0\n4|2\n").unwrap();
+    fs::write(dir.path().join("queue"), "1|0|None\n2|0|Priority\n2|1|JobHeldUser\n3|0|\n3|1|None\n3|2|None\n4|0|None\n4|1|launch failed requeued held\n4|2|None\n").unwrap();
     assert!(fake.tce(dir.path(), &launch).status.success());
     let calls = fs::read_to_string(dir.path().join("calls")).unwrap();
     let last = calls.lines().last().unwrap();

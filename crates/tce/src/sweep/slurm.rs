@@ -194,11 +194,11 @@ impl Sweep {
         Ok(arrays)
     }
 
-    /// Indices of the work that the queue knows.
+    /// Indices of the work that the queue knows and will do.
     fn queued(&self) -> Result<BTreeSet<usize>> {
         let name = self.job_name();
         let states = "PENDING,RUNNING,CONFIGURING,COMPLETING,SUSPENDED,REQUEUED,REQUEUE_HOLD,RESIZING,STOPPED";
-        let arguments = ["-h", "-r", "-t", states, "-n", &name, "-o", "%F|%K"].map(String::from);
+        let arguments = ["-h", "-r", "-t", states, "-n", &name, "-o", "%F|%K|%r"].map(String::from);
         let text = call("squeue", &arguments)?;
         let folder = self.directory.join("slurm");
         let mut lists: std::collections::BTreeMap<String, Vec<Vec<usize>>> = Default::default();
@@ -209,7 +209,17 @@ impl Sweep {
         }
         let mut out = BTreeSet::new();
         for line in text.lines() {
-            let Some((job, element)) = line.trim().split_once('|') else { continue };
+            let mut fields = line.trim().split('|');
+            let (Some(job), Some(element), Some(reason)) = (fields.next(), fields.next(), fields.next()) else {
+                continue;
+            };
+            // A controller that lost its memory gives numbers out twice; the node refuses the second job of a number, and Slurm
+            // holds it for ever. Whoever held a job by hand has a reason of his own, which is another word.
+            if reason.contains("requeued held") || reason.contains("requeued in held") {
+                eprintln!("job {job}_{element} is held ({reason}): it is cancelled, and its work submitted again");
+                let _ = call("scancel", &[format!("{job}_{element}")]);
+                continue;
+            }
             let elements = lists.get(job).zip(element.parse::<usize>().ok());
             out.extend(elements.and_then(|(l, k)| l.get(k)).into_iter().flatten().copied());
         }
