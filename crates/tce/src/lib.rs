@@ -8,6 +8,8 @@ mod config;
 mod diagnostics;
 mod error;
 mod expand;
+#[cfg(test)]
+mod fuzz;
 mod generator;
 mod inputs;
 mod layers;

@@ -32,6 +32,8 @@ pub mod slurm;
 pub mod status;
 pub mod work;
 
+/// More runs than anybody has machines for are a slip of the finger.
+const MOST_RUNS: u64 = 100_000;
 /// Changes when manifests of before cannot be read.
 const FORMAT: u32 = 1;
 
@@ -237,7 +239,12 @@ impl Manifest {
             configs: BTreeMap::new(),
             entries: 0,
         };
+        let runs = [tasks.len(), variants.len(), overrides.len()].iter().product::<usize>() as u64;
+        if description.seeds > MOST_RUNS / runs || description.first_seed.checked_add(description.seeds).is_none() {
+            return Err(failed(&format!("{runs} x {} runs; a sweep has at most {MOST_RUNS}", description.seeds)));
+        }
         let mut plan = Self { header, entries: Vec::new() };
+        let mut known = BTreeMap::new();
         for &task in &tasks {
             for &variant in &variants {
                 for Override { name, set } in overrides {
@@ -245,7 +252,7 @@ impl Manifest {
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
                     for seed in description.first_seed..description.first_seed + description.seeds {
-                        plan.add_run(task, variant, name, &config, seed);
+                        plan.add_run(&mut known, task, variant, name, &config, seed);
                     }
                 }
             }
@@ -253,15 +260,23 @@ impl Manifest {
         Ok(plan.sorted())
     }
 
-    fn add(&mut self, entry: Entry) -> usize {
-        let same = self.entries.iter().position(|e| e.id == entry.id);
-        same.unwrap_or_else(|| {
+    /// The place of `entry`, which is added unless it is there.
+    fn add(&mut self, known: &mut BTreeMap<String, usize>, entry: Entry) -> usize {
+        *known.entry(entry.id.clone()).or_insert_with(|| {
             self.entries.push(entry);
             self.entries.len() - 1
         })
     }
 
-    fn add_run(&mut self, task: Task, variant: Variant, label: &str, config: &Config, seed: u64) {
+    fn add_run(
+        &mut self,
+        known: &mut BTreeMap<String, usize>,
+        task: Task,
+        variant: Variant,
+        label: &str,
+        config: &Config,
+        seed: u64,
+    ) {
         let text = config.to_toml();
         let hash = sha256_hex(text.as_bytes())[..16].to_owned();
         self.header.configs.insert(hash.clone(), text);
@@ -280,11 +295,11 @@ impl Manifest {
         let mut needs = Vec::new();
         if data.target.is_none() {
             let spec = serde_json::json!([task.agent, task.shift, task.target, from_zoo]);
-            needs.push(self.add(entry(Kind::Target, spec, 0, Vec::new())));
+            needs.push(self.add(known, entry(Kind::Target, spec, 0, Vec::new())));
         }
         if config.needs_source() && data.source.is_none() {
             let spec = serde_json::json!([task.agent, task.source, config.source.rows, from_zoo]);
-            needs.push(self.add(entry(Kind::Source, spec, 0, Vec::new())));
+            needs.push(self.add(known, entry(Kind::Source, spec, 0, Vec::new())));
         }
         if config.mixture.generated || config.mixture.source == SourceRows::Relabelled {
             let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
@@ -301,11 +316,11 @@ impl Manifest {
                 generated,
                 seed
             ]);
-            needs.push(self.add(entry(Kind::Expand, spec, seed, needs.clone())));
+            needs.push(self.add(known, entry(Kind::Expand, spec, seed, needs.clone())));
         }
         let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
         let run = entry(Kind::Run, spec, seed, needs);
-        self.add(Entry { variant: Some(variant), label: label.to_owned(), ..run });
+        self.add(known, Entry { variant: Some(variant), label: label.to_owned(), ..run });
     }
 
     /// Work that others need comes first.
@@ -534,6 +549,7 @@ mod tests {
             ("tasks = []\nvariants = [\"bc\"]", "tasks"),
             ("tasks = [\"frog-*:medium->expert\"]\nvariants = [\"bc\"]", "matches none"),
             ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"frog\"]", "frog"),
+            ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nseeds = 1000000", "at most"),
             ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nseed = 3", "seed"),
             (
                 "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nset = [\"learner.frog=1\"]",
