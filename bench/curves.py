@@ -68,7 +68,7 @@ def main():
         ax.set_xlabel("environment steps, millions")
         ax.set_ylabel("return, sampled actions")
         ax.grid(alpha=0.2)
-        ax.legend(fontsize=8, loc="upper left" if robot != "hopper" else "lower right")
+        ax.legend(fontsize=8, loc="lower right")
     figure.savefig(args.out + ".png", dpi=90)
 
 

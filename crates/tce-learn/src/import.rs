@@ -184,14 +184,29 @@ impl<'a> Arrays<'a> {
     }
 }
 
+/// Texts are names of kinds.
+const LONGEST_TEXT: usize = 1000;
+
+/// The values of an array. Memory grows with what is read: the shape in a damaged file may promise anything.
+fn all<T: npyz::Deserialize, R: Read>(file: NpyFile<R>) -> std::io::Result<Vec<T>> {
+    let data = file.data().map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e.to_string()))?;
+    let mut out = Vec::new();
+    for value in data {
+        out.push(value?);
+    }
+    Ok(out)
+}
+
 /// One array: numbers of f32 or f64, or a text.
 fn parse<R: Read>(file: NpyFile<R>) -> std::io::Result<Array> {
     let shape: Vec<usize> = file.shape().iter().map(|&n| n as usize).collect();
     let (order, descr) = (file.order(), file.dtype().descr());
     let values: Vec<f64> = match descr.trim_matches('\'') {
-        "<f8" => file.into_vec()?,
-        "<f4" => file.into_vec::<f32>()?.into_iter().map(f64::from).collect(),
-        text if text.starts_with("<U") => return Ok(Array::Text(file.into_vec::<String>()?.concat())),
+        "<f8" => all(file)?,
+        "<f4" => all::<f32, _>(file)?.into_iter().map(f64::from).collect(),
+        text if text.strip_prefix("<U").is_some_and(|n| n.parse::<usize>().is_ok_and(|n| n <= LONGEST_TEXT)) => {
+            return Ok(Array::Text(all::<String, _>(file)?.concat()));
+        }
         other => {
             let what = format!("an array of type {other}; only <f4, <f8 and texts are read");
             return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
