@@ -14,11 +14,12 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use npyz::npz::NpzArchive;
+use npyz::npz::array_name_from_file_name;
 use npyz::{NpyFile, Order};
 use tce_base::FileError;
 use tce_data::Standardizer;
 use tce_nn::{Activation, NamedParameters};
+use zip::ZipArchive;
 
 use crate::error::LearnError;
 use crate::policy::{Head, Policy, PolicySpec};
@@ -130,12 +131,12 @@ impl<'a> Arrays<'a> {
     fn read(path: &'a Path) -> Result<Self, LearnError> {
         let io = |e| FileError::new(path, "read as an npz archive", e);
         let file = File::open(path).map_err(|e| FileError::new(path, "open", e))?;
-        let mut archive = NpzArchive::new(BufReader::new(file)).map_err(io)?;
-        let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
+        let mut archive = ZipArchive::new(BufReader::new(file)).map_err(|e| io(e.into()))?;
         let mut by_name = BTreeMap::new();
-        for name in names {
-            let Some(array) = archive.by_name(&name).map_err(io)? else { continue };
-            by_name.insert(name, parse(array).map_err(io)?);
+        for k in 0..archive.len() {
+            let entry = archive.by_index(k).map_err(|e| io(e.into()))?;
+            let Some(name) = array_name_from_file_name(entry.name()).map(str::to_owned) else { continue };
+            by_name.insert(name, array(entry).map_err(io)?);
         }
         Ok(Self { path, by_name })
     }
@@ -182,6 +183,24 @@ impl<'a> Arrays<'a> {
         let std: Vec<f32> = self.array(spread, 1)?.1.iter().map(|&v| divisor(v) as f32).collect();
         Ok(Standardizer { mean: self.numbers("obs_mean")?, ..Standardizer { std, ..Standardizer::identity(0) } })
     }
+}
+
+/// The bytes of an array, its header included; a policy has far fewer.
+const LARGEST_ARRAY: u64 = 1 << 28;
+
+fn array(entry: impl Read) -> std::io::Result<Array> {
+    let mut bytes = Vec::new();
+    entry.take(LARGEST_ARRAY).read_to_end(&mut bytes)?;
+    // Of the format's versions 2 and 3; npyz takes the memory for the header that they promise.
+    let promised = match (bytes.get(6), bytes.get(8..12)) {
+        (Some(2..), Some(size)) => u32::from_le_bytes(size.try_into().expect("4 bytes")) as usize,
+        _ => 0,
+    };
+    if promised > bytes.len() {
+        let what = format!("a header of {promised} bytes in an array of {}", bytes.len());
+        return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
+    }
+    parse(NpyFile::new(&bytes[..])?)
 }
 
 /// Texts are names of kinds.

@@ -88,8 +88,9 @@ fn a_training_can_begin_with_the_networks_of_another() {
         tce(dir.path(), &[&args[..], &rest, more].concat())
     };
     let learner = |place: &str| {
-        let mut files = fs::read_dir(dir.path().join(place)).unwrap().map(|e| e.unwrap().path());
-        fs::read(files.find(|p| p.to_string_lossy().contains("learner-")).unwrap()).unwrap()
+        let place = dir.path().join(place);
+        let ledger: serde_json::Value = serde_json::from_slice(&fs::read(place.join("ledger.json")).unwrap()).unwrap();
+        fs::read(place.join(ledger["files"][1][0].as_str().unwrap())).unwrap()
     };
     let from = ["--from", "first/hopper-source-seed0"];
     assert!(train("first", "hopper", "60", &[]).status.success());
