@@ -97,6 +97,10 @@ impl Stage {
         let Some(done) = self.done::<T>()? else { return Ok(None) };
         // The winner may have been killed before it gave its files their places.
         self.place(&done.attempt, done.files.keys());
+        let attempt = self.directory.join(ATTEMPTS).join(&done.attempt);
+        if attempt.exists() && Owner::of(&attempt).is_some_and(|owner| owner.dead()) {
+            self.clear(&done.attempt);
+        }
         for (name, expected) in &done.files {
             let file = self.file(name);
             let found = sha256_file(&file)?;
@@ -122,6 +126,17 @@ impl Stage {
                 let _ = fs::rename(&from, &to);
             }
         }
+    }
+
+    /// The last steps of the winning attempt, after its files are in place: metrics, which are for eyes and no part of the result,
+    /// and its directory.
+    fn clear(&self, attempt: &str) {
+        let directory = self.directory.join(ATTEMPTS).join(attempt);
+        self.place(attempt, std::iter::once(&"metrics.jsonl".to_owned()));
+        let _ = fs::rename(directory.join("tensorboard"), self.file("tensorboard"));
+        let _ = fs::remove_dir_all(&directory);
+        // Goes away with the last attempt.
+        let _ = fs::remove_dir(self.directory.join(ATTEMPTS));
     }
 
     /// Begins, or goes on with, the work of this stage.
@@ -222,10 +237,8 @@ impl Attempt {
         };
         if first {
             sync(&self.stage.directory);
-            // Metrics are for eyes, not part of the result.
-            let extra = ["metrics.jsonl".to_owned()];
-            self.stage.place(&self.name, files.iter().chain(&extra));
-            let _ = fs::rename(self.file("tensorboard"), self.stage.file("tensorboard"));
+            self.stage.place(&self.name, files.iter());
+            self.stage.clear(&self.name);
         } else {
             let winner = self.stage.done::<serde_json::Value>()?;
             if let Some(winner) = winner.filter(|w| w.files != done.files) {
@@ -242,10 +255,9 @@ impl Attempt {
                     fault.display()
                 )));
             }
+            let _ = fs::remove_dir_all(&self.directory);
+            let _ = fs::remove_dir(self.stage.directory.join(ATTEMPTS));
         }
-        let _ = fs::remove_dir_all(&self.directory);
-        // Goes away with the last attempt.
-        let _ = fs::remove_dir(self.stage.directory.join(ATTEMPTS));
         Ok(())
     }
 }
