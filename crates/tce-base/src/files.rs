@@ -73,11 +73,47 @@ impl AtomicFile {
                 .map_err(|e| FileError::new(&target, "set the permissions", e))?;
         }
         temporary.persist(&target).map_err(|e| FileError::new(&target, "rename into place", e.error))?;
-        #[cfg(unix)]
-        File::open(parent(&target))
-            .and_then(|d| d.sync_all())
-            .map_err(|e| FileError::new(&target, "flush the directory of", e))?;
-        Ok(())
+        flush_directory(&target)
+    }
+}
+
+/// Flushes the directory that `path` is in: its name there survives a loss of power.
+fn flush_directory(path: &Path) -> Result<(), FileError> {
+    #[cfg(unix)]
+    File::open(parent(path))
+        .and_then(|d| d.sync_all())
+        .map_err(|e| FileError::new(path, "flush the directory of", e))?;
+    #[cfg(not(unix))]
+    let _ = path;
+    Ok(())
+}
+
+/// Gives the complete file `own` the name `target`, too, unless that name is taken: of several that want it, the first one gets it.
+/// Whether this one did.
+///
+/// # Errors
+/// If the name is free and cannot be given.
+pub fn link_first(own: &Path, target: &Path) -> Result<bool, FileError> {
+    match fs::hard_link(own, target) {
+        Ok(()) => {}
+        Err(e) if e.kind() == io::ErrorKind::AlreadyExists => return Ok(false),
+        Err(_) if target.exists() => return Ok(false),
+        // A file system without hard links: not atomic against another one that comes in the same moment, but whole.
+        Err(_) => fs::rename(own, target).map_err(|e| FileError::new(target, "link or rename into place", e))?,
+    }
+    flush_directory(target)?;
+    Ok(true)
+}
+
+/// The content of a file; none if there is no such file.
+///
+/// # Errors
+/// If there is one, and it cannot be read.
+pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>, FileError> {
+    match fs::read(path) {
+        Ok(bytes) => Ok(Some(bytes)),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(FileError::new(path, "read", e)),
     }
 }
 
@@ -104,7 +140,7 @@ pub fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), FileError>
 
 /// The SHA-256 of `bytes` as lower-case hexadecimal.
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+    hex(&Sha256::digest(bytes))
 }
 
 /// The SHA-256 of a file, read in pieces.
@@ -118,7 +154,11 @@ pub fn sha256_file(path: &Path) -> Result<String, FileError> {
             n => hash.update(&buffer[..n]),
         }
     }
-    Ok(hash.finalize().iter().map(|b| format!("{b:02x}")).collect())
+    Ok(hex(&hash.finalize()))
+}
+
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 #[cfg(test)]
@@ -133,6 +173,20 @@ mod tests {
         file.file().write_all(b"half").unwrap();
         drop(file);
         assert_eq!(fs::read_dir(target.parent().unwrap()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_first_link_gets_the_name() {
+        let dir = tempfile::tempdir().unwrap();
+        let [a, b, name] = ["a", "b", "name"].map(|n| dir.path().join(n));
+        assert_eq!(read_if_there(&name).unwrap(), None);
+        fs::write(&a, b"first").unwrap();
+        fs::write(&b, b"second").unwrap();
+        assert!(link_first(&a, &name).unwrap());
+        assert!(!link_first(&b, &name).unwrap());
+        assert_eq!(read_if_there(&name).unwrap().unwrap(), b"first");
+        assert!(link_first(&b, &dir.path().join("nowhere/name")).is_err());
+        assert!(read_if_there(dir.path()).is_err());
     }
 
     #[test]

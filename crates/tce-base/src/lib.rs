@@ -6,7 +6,9 @@ pub mod progress;
 pub mod random;
 pub mod sealed;
 
-pub use files::{AtomicFile, FileError, sha256_file, sha256_hex, write_atomically, write_json};
+pub use files::{
+    AtomicFile, FileError, link_first, read_if_there, sha256_file, sha256_hex, write_atomically, write_json,
+};
 pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
 pub use random::{Rng, Streams};
 pub use sealed::{Sealed, read_sealed, write_sealed};

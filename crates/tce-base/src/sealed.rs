@@ -3,13 +3,11 @@
 //! `tce-sealed 1 KEY SHA256\n`. The key tells what the bytes are a part of (the hash of a specification), so that leftovers of other
 //! work are not taken for one's own; the checksum, of key and bytes, tells damage.
 
-use std::fs;
-use std::io::ErrorKind;
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use crate::files::{FileError, write_atomically};
+use crate::files::{FileError, hex, read_if_there, write_atomically};
 
 const MAGIC: &str = "tce-sealed 1";
 
@@ -31,8 +29,7 @@ fn header(key: &str, bytes: &[u8]) -> String {
     hash.update(key.as_bytes());
     hash.update(b"\n");
     hash.update(bytes);
-    let hash = hash.finalize().iter().map(|b| format!("{b:02x}")).collect::<String>();
-    format!("{MAGIC} {key} {hash}\n")
+    format!("{MAGIC} {key} {}\n", hex(&hash.finalize()))
 }
 
 /// Writes `bytes` to `path`, whole or not at all. `key` is one word.
@@ -51,11 +48,7 @@ pub fn write_sealed(path: &Path, key: &str, bytes: &[u8]) -> Result<(), FileErro
 /// # Errors
 /// If there is a file that cannot be read at all; damage is no error.
 pub fn read_sealed(path: &Path, key: &str) -> Result<Sealed, FileError> {
-    let mut all = match fs::read(path) {
-        Ok(all) => all,
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Sealed::Absent),
-        Err(e) => return Err(FileError::new(path, "read", e)),
-    };
+    let Some(mut all) = read_if_there(path)? else { return Ok(Sealed::Absent) };
     let Some(end) = all.iter().position(|b| *b == b'\n') else { return Ok(Sealed::Damaged) };
     let Some(line) = std::str::from_utf8(&all[..end]).ok().and_then(|l| l.strip_prefix(MAGIC)) else {
         return Ok(Sealed::Damaged);
@@ -74,6 +67,8 @@ pub fn read_sealed(path: &Path, key: &str) -> Result<Sealed, FileError> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

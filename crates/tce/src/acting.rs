@@ -19,14 +19,15 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_uniform;
-use tce_base::{FileError, Progress, Streams, interrupted, sha256_file, write_atomically, write_json};
-use tce_data::{Agent, LoadOptions, ScoreTable, Shift, load, reference_scores, save_d4rl};
+use tce_base::{FileError, Progress, Streams, interrupted, read_if_there, sha256_file, write_atomically, write_json};
+use tce_data::{Agent, LoadOptions, ScoreTable, Shift, load, save_d4rl};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{Buffer, Learner, Meter, Policy, PolicyLearner};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::{EPISODE_LIMIT, Env};
 
-use crate::actors::{Evaluation, evaluate_to_the_end};
+use crate::PROGRAM;
+use crate::actors::{Arena, Evaluation, evaluate};
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
 use crate::output::mean_std;
@@ -151,11 +152,8 @@ impl Ledger {
 
 /// The content of a JSON file; none if there is no such file.
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    match std::fs::read(path) {
-        Ok(bytes) => Ok(Some(serde_json::from_slice(&bytes).map_err(|e| damaged(path, &e))?)),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(e) => Err(FileError::new(path, "read", e).into()),
-    }
+    let bytes = read_if_there(path)?;
+    bytes.map(|bytes| serde_json::from_slice(&bytes).map_err(|e| damaged(path, &e))).transpose()
 }
 
 /// Two programs in one directory would delete each other's checkpoints.
@@ -418,10 +416,10 @@ impl Training {
     fn judge(&mut self) -> Result<()> {
         let Settings { agent, shift, seed, episodes, .. } = self.settings;
         let policy = self.sac.policies().remove(0);
-        let reference = reference_scores(agent, shift, ScoreTable::default());
+        let arena = Arena::new(agent, shift, ScoreTable::default());
         let streams = Streams::new(seed ^ self.ledger.step);
         // To its end even when the user interrupts: the checkpoint that follows needs it.
-        let evaluation = evaluate_to_the_end(&policy, agent, shift, episodes, streams, reference)?;
+        let evaluation = evaluate(&policy, arena, episodes, streams, false, || false)?;
         let judged = judged(&evaluation, self.ledger.step);
         let figures: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
         let figures = figures.iter().map(|(name, value)| (name.as_str(), *value));
@@ -493,7 +491,7 @@ fn save_card(policy: &Policy, path: &Path, settings: &Settings, judged: &Judged)
         std: judged.std,
         length: judged.length,
         score: judged.score,
-        program: format!("tce {}", env!("CARGO_PKG_VERSION")),
+        program: PROGRAM.into(),
     };
     let mut parameters = policy.to_parameters();
     card.attach(&mut parameters);

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{Progress, Rng, Streams, interrupted, sha256_file, sha256_hex};
-use tce_data::{Agent, Quality, ReferenceScores, Shift, Transitions, save_d4rl};
+use tce_base::{Progress, Rng, Streams, sha256_file, sha256_hex};
+use tce_data::{Agent, Quality, ReferenceScores, ScoreTable, Shift, Transitions, reference_scores, save_d4rl};
 use tce_learn::Policy;
 use tce_sim::{Actor, CollectOptions, EpisodeResult};
 
+use crate::PROGRAM;
 use crate::error::{Error, Result};
 use crate::zoo::Exhibit;
 
@@ -113,7 +114,7 @@ impl Recipe {
         attributes.insert("recipe".to_owned(), serde_json::to_string(self).expect("plain data"));
         attributes.insert("agent".to_owned(), self.agent.to_string());
         attributes.insert("shift".to_owned(), self.shift.to_string());
-        attributes.insert("program".to_owned(), format!("tce {}", env!("CARGO_PKG_VERSION")));
+        attributes.insert("program".to_owned(), PROGRAM.to_owned());
         for (k, part) in self.parts.iter().enumerate() {
             let hash = match Exhibit::at(&part.actor)? {
                 Some(exhibit) => exhibit.sha256(),
@@ -229,31 +230,35 @@ impl Evaluation {
     }
 }
 
-/// Rolls `policy` out for `episodes` episodes, by its `mean` action or by sampled ones.
+/// Where policies are judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Arena {
+    /// The robot.
+    pub agent: Agent,
+    /// The domain.
+    pub shift: Shift,
+    /// Returns that stand for 0 and 100.
+    pub reference: Option<ReferenceScores>,
+}
+
+impl Arena {
+    /// With the references of `table`, where it has any.
+    pub fn new(agent: Agent, shift: Shift, table: ScoreTable) -> Self {
+        Self { agent, shift, reference: reference_scores(agent, shift, table) }
+    }
+}
+
+/// Rolls `policy` out for `episodes` episodes, by its `mean` action or by sampled ones, unless `stop` says so:
+/// [`tce_base::interrupted`] where the user may end it.
 pub fn evaluate(
     policy: &Policy,
-    agent: Agent,
-    shift: Shift,
+    arena: Arena,
     episodes: usize,
     streams: Streams,
     mean: bool,
-    reference: Option<ReferenceScores>,
+    stop: impl Fn() -> bool,
 ) -> Result<Evaluation> {
     let actor = PolicyActor::new(policy.clone(), mean);
-    let results = tce_sim::evaluate(agent, shift, &actor, episodes, streams, interrupted)?;
-    Ok(Evaluation::of(&results, reference))
-}
-
-/// The same with sampled actions, and not to be interrupted.
-pub fn evaluate_to_the_end(
-    policy: &Policy,
-    agent: Agent,
-    shift: Shift,
-    episodes: usize,
-    streams: Streams,
-    reference: Option<ReferenceScores>,
-) -> Result<Evaluation> {
-    let actor = PolicyActor::new(policy.clone(), false);
-    let results = tce_sim::evaluate(agent, shift, &actor, episodes, streams, || false)?;
-    Ok(Evaluation::of(&results, reference))
+    let results = tce_sim::evaluate(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
+    Ok(Evaluation::of(&results, arena.reference))
 }

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
-use tce_data::{Agent, ReferenceScores, Shift, Standardizer, Transitions};
+use tce_base::{Streams, interrupted};
+use tce_data::{Standardizer, Transitions};
 use tce_learn::{
     Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
     return_range_scale, train_side_by_side,
@@ -15,7 +15,7 @@ use tce_learn::{
 use tce_nn::{Checkpoints, Device, is_cpu};
 use tce_sim::SimError;
 
-use crate::actors::{Evaluation, evaluate};
+use crate::actors::{Arena, Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
@@ -32,17 +32,6 @@ pub struct MemberData {
     pub extra: Option<Arc<Transitions>>,
     /// Tables with real trajectories, whose returns the reward scale is taken from.
     pub trajectories: Vec<Arc<Transitions>>,
-}
-
-/// Where policies are judged, if they can be.
-#[derive(Clone, Copy, Debug)]
-pub struct Arena {
-    /// The robot.
-    pub agent: Agent,
-    /// The domain.
-    pub shift: Shift,
-    /// Returns that stand for 0 and 100.
-    pub reference: Option<ReferenceScores>,
 }
 
 /// Where metrics and checkpoints are kept, and what tells this learning from others.
@@ -187,8 +176,7 @@ fn judge(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Arena) -> R
         .par_iter()
         .zip(seeds)
         .map(|(p, &seed)| {
-            let judged = evaluate(p, arena.agent, arena.shift, episodes, Streams::new(seed), true, arena.reference);
-            match judged {
+            match evaluate(p, arena, episodes, Streams::new(seed), true, interrupted) {
                 // One member that has diverged must not cost the others their result.
                 Err(Error::Sim(e @ SimError::NotFinite { .. })) => {
                     eprintln!("seed {seed}: {e}; it has no score");

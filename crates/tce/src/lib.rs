@@ -26,5 +26,8 @@ mod units;
 mod variant;
 mod zoo;
 
+/// What files say about who wrote them.
+const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));
+
 pub use commands::Cli;
 pub use error::{Error, Result};

@@ -7,7 +7,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use tce_base::FileError;
+use tce_base::{FileError, read_if_there, write_atomically};
 
 /// The metrics of one stage, written line by line: what a killed run had is there to be looked at.
 pub struct Metrics {
@@ -23,16 +23,13 @@ impl Metrics {
     pub fn resume(directory: &Path, keep: impl Fn(&str, u64) -> bool) -> Result<Self, FileError> {
         fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let path = directory.join("metrics.jsonl");
-        let old = match fs::read(&path) {
-            Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
-            Err(e) => return Err(FileError::new(&path, "read", e)),
-        };
+        let old = read_if_there(&path)?.unwrap_or_default();
+        let old = String::from_utf8_lossy(&old);
         // The last line may be half written.
         let lines = old.lines().filter_map(|line| Some((line, serde_json::from_str::<Line>(line).ok()?)));
         let kept: Vec<_> = lines.filter(|(_, line)| keep(&line.stage, line.step)).collect();
         let text: String = kept.iter().map(|(line, _)| format!("{line}\n")).collect();
-        tce_base::write_atomically(&path, text.as_bytes())?;
+        write_atomically(&path, text.as_bytes())?;
         let file = OpenOptions::new().append(true).open(&path).map_err(|e| FileError::new(&path, "open", e))?;
         let events_root = directory.join("tensorboard");
         match fs::remove_dir_all(&events_root) {

@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 use tce_base::{write_atomically, write_json};
 use tce_nn::Device;
 
-use crate::actors::Evaluation;
+use crate::actors::{Arena, Evaluation};
 use crate::config::{Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows};
 use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
-use crate::learning::{Arena, Learned, MemberData, Place, learn};
+use crate::learning::{Learned, MemberData, Place, learn};
 use crate::mixture::extra_rows;
 use crate::stage::Stage;
 
@@ -129,9 +129,7 @@ pub fn run(
     };
     let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
     let arena = match (inputs.agent, inputs.shift) {
-        (Some(agent), Some(shift)) => {
-            Some(Arena { agent, shift, reference: inputs.reference(config.evaluation.scores) })
-        }
+        (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
     };
     let extra_count = extra.as_ref().map_or(0, |e| e[0].len());

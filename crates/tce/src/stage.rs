@@ -17,9 +17,10 @@ use std::time::SystemTime;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, sha256_file, sha256_hex, write_json};
+use tce_base::{FileError, link_first, read_if_there, sha256_file, sha256_hex, write_json};
 use tce_nn::Checkpoints;
 
+use crate::PROGRAM;
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
 
@@ -79,11 +80,7 @@ impl Stage {
 
     fn done<T: DeserializeOwned>(&self) -> Result<Option<Done<T>>> {
         let path = self.file("done.json");
-        let bytes = match fs::read(&path) {
-            Ok(bytes) => bytes,
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(FileError::new(&path, "read", e).into()),
-        };
+        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
         serde_json::from_slice(&bytes)
             .map(Some)
             .map_err(|e| Error::Failed(format!("{}: {e}; remove the directory to do the stage again", path.display())))
@@ -129,12 +126,17 @@ impl Stage {
     }
 
     /// The last steps of the winning attempt, after its files are in place: metrics, which are for eyes and no part of the result,
-    /// and its directory.
+    /// and its end.
     fn clear(&self, attempt: &str) {
         let directory = self.directory.join(ATTEMPTS).join(attempt);
         self.place(attempt, std::iter::once(&"metrics.jsonl".to_owned()));
         let _ = fs::rename(directory.join("tensorboard"), self.file("tensorboard"));
-        let _ = fs::remove_dir_all(&directory);
+        self.discard(attempt);
+    }
+
+    /// Removes an attempt.
+    fn discard(&self, attempt: &str) {
+        let _ = fs::remove_dir_all(self.directory.join(ATTEMPTS).join(attempt));
         // Goes away with the last attempt.
         let _ = fs::remove_dir(self.directory.join(ATTEMPTS));
     }
@@ -224,19 +226,10 @@ impl Attempt {
     /// If another attempt was first with other bytes; if a file cannot be read or written.
     pub fn finish<T: Serialize>(self, files: &[String], summary: T) -> Result<()> {
         let hashes = files.iter().map(|f| Ok((f.clone(), sha256_file(&self.file(f))?))).collect::<Result<_>>()?;
-        let program = format!("tce {}", env!("CARGO_PKG_VERSION"));
-        let done = Done { program, attempt: self.name.clone(), files: hashes, summary };
+        let done = Done { program: PROGRAM.into(), attempt: self.name.clone(), files: hashes, summary };
         let own = self.file("done.json");
         write_json(&own, &done)?;
-        let path = self.stage.file("done.json");
-        let first = match fs::hard_link(&own, &path) {
-            Ok(()) => true,
-            Err(e) if e.kind() == ErrorKind::AlreadyExists => false,
-            // A file system without hard links: not atomic against a copy that ends in the same moment, but whole.
-            Err(_) => !path.exists() && fs::rename(&own, &path).is_ok(),
-        };
-        if first {
-            sync(&self.stage.directory);
+        if link_first(&own, &self.stage.file("done.json"))? {
             self.stage.place(&self.name, files.iter());
             self.stage.clear(&self.name);
         } else {
@@ -255,18 +248,10 @@ impl Attempt {
                     fault.display()
                 )));
             }
-            let _ = fs::remove_dir_all(&self.directory);
-            let _ = fs::remove_dir(self.stage.directory.join(ATTEMPTS));
+            self.stage.discard(&self.name);
         }
         Ok(())
     }
-}
-
-fn sync(directory: &Path) {
-    #[cfg(unix)]
-    let _ = fs::File::open(directory).and_then(|d| d.sync_all());
-    #[cfg(not(unix))]
-    let _ = directory;
 }
 
 /// The time of the last change below `directory`.

@@ -3,15 +3,9 @@
 mod common;
 
 use std::fs;
-use std::process::Output;
 
-use common::{tce, tce_json};
+use common::{message, tce, tce_json};
 use tce_data::{LoadOptions, load};
-
-/// What was printed on stderr, with the frame around it and the line breaks taken out.
-fn message(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ")
-}
 
 const SMALL: &[&str] = &["--start", "120", "--evaluate-every", "100", "--episodes", "2", "--checkpoint-every", "60"];
 

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use common::{TINY, data_pair, random_rows, tce};
+use common::{TINY, Tmpfs, data_pair, message, random_rows, tce};
 use tce_data::{Agent, Shift, save_d4rl};
 
 /// Runs `augment` and returns its exit code and message; the output must not exist afterwards.
@@ -21,9 +21,7 @@ fn augment(dir: &Path, source: &str, target: &str, more: &[&str]) -> (i32, Strin
         .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains(".part"))
         .collect();
     assert!(parts.is_empty(), "nothing half-written: {parts:?}");
-    // miette wraps lines and draws a margin; the words matter here.
-    let text = String::from_utf8_lossy(&output.stderr).replace(['│', '\n'], " ");
-    (output.status.code().unwrap(), text.split_whitespace().collect::<Vec<_>>().join(" "))
+    (output.status.code().unwrap(), message(&output))
 }
 
 #[test]
@@ -106,15 +104,7 @@ fn wrong_calls_end_with_code_2() {
 fn a_full_disk_leaves_nothing_behind() {
     let dir = tempfile::tempdir().unwrap();
     let mount = dir.path().join("small");
-    fs::create_dir(&mount).unwrap();
-    let mounted = std::process::Command::new("mount")
-        .args(["-t", "tmpfs", "-o", "size=16k", "tmpfs", mount.to_str().unwrap()])
-        .status()
-        .is_ok_and(|s| s.success());
-    if !mounted {
-        eprintln!("SKIPPED: a_full_disk_leaves_nothing_behind needs the right to mount a tmpfs");
-        return;
-    }
+    let Some(disk) = Tmpfs::mount(&mount, 16, "a_full_disk_leaves_nothing_behind") else { return };
     data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let out = mount.join("out.hdf5");
     let mut args =
@@ -122,7 +112,7 @@ fn a_full_disk_leaves_nothing_behind() {
     args.extend(TINY);
     let output = tce(dir.path(), &args);
     let left = fs::read_dir(&mount).unwrap().count();
-    let _ = std::process::Command::new("umount").arg(&mount).status();
+    drop(disk);
     let message = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{message}");
     assert!(message.to_lowercase().contains("space"), "{message}");

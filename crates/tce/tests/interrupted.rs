@@ -5,10 +5,10 @@ mod common;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
-use common::tce;
+use common::{Tmpfs, files, silent, tce};
 use tce_base::{Rng, Streams, sha256_hex};
 
 /// The whole pipeline in some seconds, with every stage long enough to be hit.
@@ -29,17 +29,9 @@ const SMALL: &[&str] = &[
     "--set=evaluation.every=150",
 ];
 
-/// `tce` in `directory` with a checkpoint at every opportunity, silent.
+/// The program at work, with a checkpoint at every opportunity.
 fn start(directory: &Path, args: &[&str]) -> Child {
-    Command::new(env!("CARGO_BIN_EXE_tce"))
-        .args(["--save-every", "0"])
-        .args(args)
-        .current_dir(directory)
-        .env("TCE_SHARED", directory.join("no-shared-folder"))
-        .stdout(Stdio::null())
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("the binary runs")
+    silent(directory, args).spawn().expect("the binary runs")
 }
 
 fn pipeline(out: &str) -> Vec<&str> {
@@ -50,35 +42,27 @@ fn pipeline(out: &str) -> Vec<&str> {
 /// Every file below `root` by its path, as far as it is a result: hashes, for records of times what else they hold.
 fn results(root: &Path) -> BTreeMap<String, String> {
     let mut out = BTreeMap::new();
-    let mut open = vec![root.to_owned()];
-    while let Some(directory) = open.pop() {
-        for entry in fs::read_dir(&directory).unwrap() {
-            let path = entry.unwrap().path();
-            let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-            if path.is_dir() {
-                // TensorBoard's events hold the time.
-                if name != "tensorboard" {
-                    open.push(path);
-                }
-                continue;
-            }
-            let bytes = fs::read(&path).unwrap();
-            let content = match name.as_str() {
-                "done.json" => {
-                    let done: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
-                    done["files"].to_string()
-                }
-                // Two networks that train side by side take turns in it as it comes.
-                "metrics.jsonl" => {
-                    let mut lines: Vec<_> = std::str::from_utf8(&bytes).unwrap().lines().collect();
-                    lines.sort_unstable();
-                    lines.join("\n")
-                }
-                "lock" => continue,
-                _ => sha256_hex(&bytes),
-            };
-            out.insert(path.strip_prefix(root).unwrap().display().to_string(), content);
+    for path in files(root) {
+        let name = path.strip_prefix(root).unwrap().display().to_string();
+        // TensorBoard's events hold the time.
+        if path.iter().any(|part| part == "tensorboard") || path.file_name().is_some_and(|n| n == "lock") {
+            continue;
         }
+        let bytes = fs::read(&path).unwrap();
+        let content = match path.file_name().unwrap().to_str().unwrap() {
+            "done.json" => {
+                let done: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+                done["files"].to_string()
+            }
+            // Two networks that train side by side take turns in it as it comes.
+            "metrics.jsonl" => {
+                let mut lines: Vec<_> = std::str::from_utf8(&bytes).unwrap().lines().collect();
+                lines.sort_unstable();
+                lines.join("\n")
+            }
+            _ => sha256_hex(&bytes),
+        };
+        out.insert(name, content);
     }
     out
 }
@@ -99,20 +83,8 @@ fn below(rng: &mut Rng, n: u64) -> u64 {
 
 /// Checkpoints and chunks below `root`.
 fn kept(root: &Path) -> Vec<PathBuf> {
-    let mut out = Vec::new();
-    let mut open = vec![root.to_owned()];
-    while let Some(directory) = open.pop() {
-        for path in fs::read_dir(&directory).into_iter().flatten().map(|e| e.unwrap().path()) {
-            let kept = path.extension().is_some_and(|e| e == "checkpoint" || e == "chunk");
-            if path.is_dir() {
-                open.push(path);
-            } else if kept {
-                out.push(path);
-            }
-        }
-    }
-    out.sort();
-    out
+    let kept = |p: &PathBuf| p.extension().is_some_and(|e| e == "checkpoint" || e == "chunk");
+    files(root).into_iter().filter(kept).collect()
 }
 
 /// Cuts a file, or flips a bit of it.
@@ -248,53 +220,19 @@ fn three_copies_at_once_are_harmless() {
     assert_same(&results(&dir.path().join("alone")), &dir.path().join("together"), "three copies");
 }
 
-/// A small file system in memory; none where this user may not mount one.
-struct Tmpfs(PathBuf);
-
-impl Tmpfs {
-    fn mount(at: &Path, kilobytes: u32) -> Option<Self> {
-        fs::create_dir_all(at).unwrap();
-        let size = format!("size={kilobytes}k");
-        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(at).output().ok()?;
-        mounted.status.success().then(|| Self(at.to_owned()))
-    }
-
-    fn resize(&self, kilobytes: u32) {
-        let options = format!("remount,size={kilobytes}k");
-        assert!(Command::new("mount").args(["-o", &options]).arg(&self.0).status().unwrap().success());
-    }
-}
-
-impl Drop for Tmpfs {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
-    }
-}
-
 #[test]
 fn a_full_disk_costs_time_only() {
     let dir = tempfile::tempdir().unwrap();
     assert!(start(dir.path(), &pipeline("whole")).wait().unwrap().success());
     let expected = results(&dir.path().join("whole"));
-    let size: u64 = {
-        let mut open = vec![dir.path().join("whole")];
-        let mut sum = 0;
-        while let Some(directory) = open.pop() {
-            for path in fs::read_dir(&directory).unwrap().map(|e| e.unwrap().path()) {
-                if path.is_dir() { open.push(path) } else { sum += path.metadata().unwrap().len() }
-            }
-        }
-        sum / 1024
-    };
-    let Some(disk) = Tmpfs::mount(&dir.path().join("small"), 64) else {
-        eprintln!("SKIPPED: no tmpfs can be mounted here");
-        return;
-    };
+    let bytes: u64 = files(&dir.path().join("whole")).iter().map(|p| p.metadata().unwrap().len()).sum();
+    let size = bytes / 1024;
+    let Some(disk) = Tmpfs::mount(&dir.path().join("small"), 64, "a full disk") else { return };
     let args = pipeline("small/runs");
     let mut refused = 0;
     // More and more space, until the whole run fits.
     for share in [10, 30, 50, 70, 90, 110, 400] {
-        disk.resize((size * share / 100) as u32);
+        disk.resize(size * share / 100);
         let output = start(dir.path(), &args).wait_with_output().unwrap();
         if !output.status.success() {
             refused += 1;

@@ -5,25 +5,14 @@ mod common;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use common::{TINY, data_pair, tce, tce_json};
+use common::{TINY, data_pair, files, tce, tce_json};
 use tce_data::{Agent, LoadOptions, Shift, load};
 
 /// All files under `root` that are results: data sets and policies, by name relative to it.
 fn results(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut found = Vec::new();
-    let mut open = vec![root.to_owned()];
-    while let Some(directory) = open.pop() {
-        for entry in fs::read_dir(&directory).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                open.push(path);
-            } else if path.extension().is_some_and(|e| e == "hdf5" || e == "safetensors") {
-                found.push((path.strip_prefix(root).unwrap().to_owned(), fs::read(&path).unwrap()));
-            }
-        }
-    }
-    found.sort();
-    found
+    let result = |p: &PathBuf| p.extension().is_some_and(|e| e == "hdf5" || e == "safetensors");
+    let found = files(root).into_iter().filter(result);
+    found.map(|p| (p.strip_prefix(root).unwrap().to_owned(), fs::read(&p).unwrap())).collect()
 }
 
 #[test]

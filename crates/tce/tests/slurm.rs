@@ -12,7 +12,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use common::sweeps::{describe, outcomes};
-use common::tce;
+use common::{Tmpfs, program, tce};
 use serde_json::Value;
 
 /// Two nodes, each in a name space of processes of its own, so that its end is the end of all that runs on it.
@@ -139,13 +139,7 @@ impl Cluster {
     }
 
     fn tce(&self, directory: &Path, args: &[&str]) -> Output {
-        quiet(
-            self.command(env!("CARGO_BIN_EXE_tce"))
-                .args(["--save-every", "0"])
-                .args(args)
-                .current_dir(directory)
-                .env("TCE_SHARED", directory.join("no-shared-folder")),
-        )
+        quiet(program(directory, args).args(["--save-every", "0"]).env("SLURM_CONF", self.base.join("slurm.conf")))
     }
 
     fn launch(&self, directory: &Path, sweep: &str, more: &[&str]) {
@@ -202,32 +196,6 @@ impl Drop for Cluster {
     }
 }
 
-/// A small file system in memory; none, and a line that says so, where none can be mounted.
-struct Disk(PathBuf);
-
-impl Disk {
-    fn mount(at: &Path) -> Option<Self> {
-        fs::create_dir_all(at).unwrap();
-        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(at).output();
-        if mounted.is_ok_and(|o| o.status.success()) {
-            return Some(Self(at.to_owned()));
-        }
-        eprintln!("SKIPPED, the full folder: no tmpfs can be mounted here");
-        None
-    }
-
-    fn resize(&self, kilobytes: u32) -> bool {
-        let options = format!("remount,size={kilobytes}k");
-        Command::new("mount").args(["-o", &options]).arg(&self.0).status().is_ok_and(|s| s.success())
-    }
-}
-
-impl Drop for Disk {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
-    }
-}
-
 const CONFIG: &str = "
 ClusterName=tce
 SlurmctldHost=HOST(127.0.0.1)
@@ -269,7 +237,7 @@ fn whatever_happens_to_the_cluster_every_result_is_right() {
     let dir = tempfile::tempdir().unwrap();
     let place = dir.path();
     // Before the nodes: they have mounts of their own, which are those of their beginning.
-    let disk = Disk::mount(&place.join("full"));
+    let disk = Tmpfs::mount(&place.join("full"), 1024, "the full folder");
     let Some(mut cluster) = Cluster::start(&place.join("slurm")) else { return };
     let file = describe(place, "s", 2);
     let plan = |out: &str| assert!(tce(place, &["sweep", "plan", &file, "--out", out]).status.success());
@@ -369,12 +337,12 @@ fn whatever_happens_to_the_cluster_every_result_is_right() {
 
     // The shared folder is full for a while.
     if let Some(disk) = disk.as_ref().filter(|_| wanted("full")) {
-        assert!(disk.resize(150));
+        disk.resize(150);
         plan("full");
         cluster.launch(place, "full", &[]);
         wait_for("an end of what does not fit", 120, || cluster.call("squeue", &["-h"]).trim().is_empty());
         assert!(outcomes(&place.join("full")).len() < expected.len(), "everything fitted into the small folder");
-        assert!(disk.resize(1 << 20));
+        disk.resize(1 << 20);
         cluster.finish(place, "full", 120);
         check("full");
     }

@@ -6,17 +6,13 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output};
 use std::time::Duration;
 
 use common::sweeps::{SETS, describe, outcomes};
-use common::{tce, tce_json};
+use common::{message, program, silent, tce, tce_json};
 use rand::RngExt;
 use tce_base::Streams;
-
-fn message(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ")
-}
 
 #[test]
 fn a_sweep_ends_with_every_result_right() {
@@ -89,18 +85,9 @@ fn a_sweep_ends_with_every_result_right() {
     assert_eq!(outcomes(&dir.path().join(folder)), before);
 }
 
-/// The program in a process group of its own, so that it can be killed with all its children.
-fn in_group(directory: &Path, args: &[&str]) -> std::process::Child {
-    Command::new(env!("CARGO_BIN_EXE_tce"))
-        .args(["--save-every", "0"])
-        .args(args)
-        .current_dir(directory)
-        .env("TCE_SHARED", directory.join("no-shared-folder"))
-        .stdout(Stdio::null())
-        .stderr(Stdio::piped())
-        .process_group(0)
-        .spawn()
-        .unwrap()
+/// The program in a process group of its own, so that its children outlive it.
+fn in_group(directory: &Path, args: &[&str]) -> Child {
+    silent(directory, args).process_group(0).spawn().unwrap()
 }
 
 #[test]
@@ -122,7 +109,7 @@ fn a_sweep_survives_its_launcher_and_its_workers() {
         // Workers outlive their launcher. Now and then they die with it; otherwise they are the second copy of what the next
         // launcher starts.
         if round % 2 == 0 {
-            let _ = Command::new("pkill").args(["-9", "-f", &format!("run-one {}", "killed")]).status();
+            let _ = Command::new("pkill").args(["-9", "-f", "run-one killed"]).status();
         }
     }
     let last = in_group(dir.path(), &["sweep", "launch", "killed", "--workers", "2"]).wait_with_output().unwrap();
@@ -179,13 +166,7 @@ impl Fake {
 
     fn tce(&self, directory: &Path, args: &[&str]) -> Output {
         let path = format!("{}:{}", self.bin.display(), std::env::var("PATH").unwrap());
-        Command::new(env!("CARGO_BIN_EXE_tce"))
-            .args(args)
-            .current_dir(directory)
-            .env("PATH", path)
-            .env("TCE_SHARED", directory.join("no-shared-folder"))
-            .output()
-            .unwrap()
+        program(directory, args).env("PATH", path).output().unwrap()
     }
 }
 

@@ -75,7 +75,7 @@ impl Augment {
             ("target_sha256".to_owned(), inputs.target.hash.clone()),
             ("seed".to_owned(), self.seed.to_string()),
             ("config".to_owned(), config.to_toml()),
-            ("program".to_owned(), format!("tce {}", env!("CARGO_PKG_VERSION"))),
+            ("program".to_owned(), crate::PROGRAM.to_owned()),
         ]);
         save_d4rl(&self.out, &rows, &attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };

@@ -70,7 +70,7 @@ impl Bench {
             core_gflops = core_gflops.max(tce_nn::product_rate(0.05));
         }
         let report = Report {
-            program: format!("tce {}", env!("CARGO_PKG_VERSION")),
+            program: crate::PROGRAM.to_owned(),
             processor: processor(),
             instructions: tce_nn::instructions(),
             threads: rayon::current_num_threads(),

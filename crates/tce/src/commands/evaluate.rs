@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_base::Streams;
-use tce_data::{Agent, ScoreTable, Shift, reference_scores};
+use tce_base::{Streams, interrupted};
+use tce_data::{Agent, ScoreTable, Shift};
 
-use crate::actors::{Evaluation, evaluate, load_policy};
+use crate::actors::{Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::output::{Output, mean_std, table};
 use crate::task::parse_environment;
@@ -47,12 +47,12 @@ impl Evaluate {
             return Err(Error::Usage("--episodes must be at least 1".into()));
         }
         let (agent, shift) = self.env;
-        let reference = reference_scores(agent, shift, ScoreTable::default());
+        let arena = Arena::new(agent, shift, ScoreTable::default());
         let policies: Vec<_> = self.policies.iter().map(|p| load_policy(p, agent)).collect::<Result<_>>()?;
         let mut all = Vec::new();
         for (path, policy) in self.policies.iter().zip(&policies) {
             let streams = Streams::new(self.seed);
-            let evaluation = evaluate(policy, agent, shift, self.episodes, streams, !self.sample, reference)?;
+            let evaluation = evaluate(policy, arena, self.episodes, streams, !self.sample, interrupted)?;
             all.push(Evaluated { policy: path.clone(), environment: format!("{agent}-{shift}"), evaluation });
         }
         output.print(&all, |all| {

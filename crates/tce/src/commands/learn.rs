@@ -6,13 +6,14 @@ use std::sync::Arc;
 use clap::Args;
 use serde::Serialize;
 use tce_base::{sha256_file, sha256_hex};
-use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, reference_scores};
+use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load};
 use tce_nn::cpu;
 
+use crate::actors::Arena;
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
 use crate::layers::ConfigArgs;
-use crate::learning::{Arena, Learned, MemberData, Place, learn};
+use crate::learning::{Learned, MemberData, Place, learn};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
 use crate::task::parse_environment;
@@ -84,11 +85,7 @@ impl Learn {
         if let Some(extra) = &extra {
             ensure_same_agent(extra, &target)?;
         }
-        let arena = self.env.map(|(agent, shift)| Arena {
-            agent,
-            shift,
-            reference: reference_scores(agent, shift, ScoreTable::default()),
-        });
+        let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
         let member = |&seed: &u64| MemberData {
             seed,
             target: target.clone(),

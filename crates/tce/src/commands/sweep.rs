@@ -198,12 +198,7 @@ impl Launch {
                 Ok(())
             }
             Launcher::Local if self.dry_run => {
-                let mut missing = Vec::new();
-                for entry in sweep.entries() {
-                    if sweep.outcome(entry)?.is_none() {
-                        missing.push(entry.to_string());
-                    }
-                }
+                let missing: Vec<String> = sweep.missing()?.iter().map(ToString::to_string).collect();
                 output.print(&missing, |m| m.join("\n"));
                 Ok(())
             }

@@ -4,12 +4,12 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use tce_base::{Streams, write_atomically};
-use tce_data::{ScoreTable, reference_scores};
+use tce_base::{Streams, interrupted, write_atomically};
+use tce_data::ScoreTable;
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
 
-use crate::actors::{Evaluation, evaluate};
+use crate::actors::{Arena, Evaluation, evaluate};
 use crate::error::{Error, Result};
 use crate::output::{Output, mean_std, table};
 use crate::zoo::{Card, Exhibit};
@@ -185,8 +185,7 @@ impl Rollout {
 }
 
 fn judge(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
-    let reference = reference_scores(card.agent, card.shift, ScoreTable::default());
-    evaluate(policy, card.agent, card.shift, episodes, streams, mean, reference)
+    evaluate(policy, Arena::new(card.agent, card.shift, ScoreTable::default()), episodes, streams, mean, interrupted)
 }
 
 impl Keep {

@@ -31,12 +31,7 @@ impl Sweep {
     /// # Errors
     /// If a process cannot be started, or the user interrupts; the processes are then given the time to write their checkpoints.
     pub fn launch_here(&self, share: Share) -> Result<usize> {
-        let mut todo: BTreeSet<usize> = BTreeSet::new();
-        for entry in self.entries() {
-            if self.outcome(entry)?.is_none() {
-                todo.insert(entry.index);
-            }
-        }
+        let mut todo: BTreeSet<usize> = self.missing()?.iter().map(|e| e.index).collect();
         let progress = Progress::new("sweep", todo.len() as u64, "pieces of work");
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
         let mut running: BTreeMap<usize, Child> = BTreeMap::new();

@@ -17,8 +17,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, sha256_hex, write_atomically};
+use tce_base::{FileError, read_if_there, sha256_hex, write_atomically};
 
+use crate::PROGRAM;
 use crate::config::{Config, SourceRows};
 use crate::error::{Error, Result};
 use crate::inputs::DataArgs;
@@ -233,7 +234,7 @@ impl Manifest {
         let header = Header {
             format: FORMAT,
             name: path.file_stem().map_or_else(String::new, |s| s.to_string_lossy().into_owned()),
-            program: format!("tce {}", env!("CARGO_PKG_VERSION")),
+            program: PROGRAM.into(),
             from_zoo: description.from_zoo,
             data,
             configs: BTreeMap::new(),
@@ -443,16 +444,15 @@ impl Sweep {
     pub fn create(directory: &Path, manifest: Manifest) -> Result<Self> {
         let path = directory.join("manifest.jsonl");
         let text = manifest.to_jsonl();
-        match fs::read_to_string(&path) {
-            Ok(old) if old == text => {}
-            Ok(_) => {
+        match read_if_there(&path)? {
+            Some(old) if old == text.as_bytes() => {}
+            Some(_) => {
                 return Err(Error::Usage(format!(
                     "{}: holds another plan, and a plan does not change; give another folder",
                     path.display()
                 )));
             }
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => write_atomically(&path, text.as_bytes())?,
-            Err(e) => return Err(FileError::new(&path, "read", e).into()),
+            None => write_atomically(&path, text.as_bytes())?,
         }
         Ok(Self { directory: directory.to_owned(), manifest })
     }

@@ -4,14 +4,15 @@
 //! submitted already. Should the queue forget a job, or a node be given up for dead whose processes live on, another launch or a second
 //! copy of the work does no harm (see [`super::work`]).
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
-use tce_base::{Streams, sha256_hex, write_atomically};
+use tce_base::{sha256_hex, write_atomically};
 
 use super::{Kind, Sweep};
 use crate::error::{Error, Result};
@@ -132,16 +133,13 @@ impl Sweep {
             self.directory.canonicalize().map_err(|e| tce_base::FileError::new(&self.directory, "find", e))?;
         let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let folder = directory.join("slurm");
+        let missing = self.missing()?;
         let mut arrays: Vec<Array> = Vec::new();
         let mut before: Vec<String> = Vec::new();
         for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Expand], &[Kind::Run]] {
-            let mut missing = Vec::new();
-            for entry in self.entries().iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index)) {
-                if self.outcome(entry)?.is_none() {
-                    missing.push(entry.index);
-                }
-            }
-            let elements: Vec<Vec<usize>> = missing.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();
+            let due = missing.iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index));
+            let due: Vec<usize> = due.map(|e| e.index).collect();
+            let elements: Vec<Vec<usize>> = due.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();
             let mut jobs = Vec::new();
             for elements in elements.chunks(limit) {
                 let stem = folder.join(unique());
@@ -201,7 +199,7 @@ impl Sweep {
         let arguments = ["-h", "-r", "-t", states, "-n", &name, "-o", "%F|%K|%r"].map(String::from);
         let text = call("squeue", &arguments)?;
         let folder = self.directory.join("slurm");
-        let mut lists: std::collections::BTreeMap<String, Vec<Vec<usize>>> = Default::default();
+        let mut lists: BTreeMap<String, Vec<Vec<usize>>> = BTreeMap::new();
         for path in fs::read_dir(&folder).into_iter().flatten().flatten().map(|e| e.path()) {
             if path.extension().is_some_and(|e| e == "job") {
                 lists.insert(fs::read_to_string(&path).unwrap_or_default(), list(&path.with_extension("list")));
@@ -232,13 +230,9 @@ fn list(path: &Path) -> Vec<Vec<usize>> {
     text.lines().map(|line| line.split(' ').filter_map(|word| word.parse().ok()).collect()).collect()
 }
 
-/// A name that no other submission has.
-fn unique() -> PathBuf {
-    use rand::RngExt;
-    use std::sync::atomic::{AtomicU64, Ordering};
+/// A name that no other submission has: the process's, and a number of its own.
+fn unique() -> String {
     static COUNT: AtomicU64 = AtomicU64::new(0);
-    let owner = Owner::this().to_string();
-    let n = COUNT.fetch_add(1, Ordering::Relaxed);
-    let mark: u32 = Streams::new(super::work::now()).stream(&owner).random();
-    PathBuf::from(format!("{}-{n}-{mark:08x}", super::work::now()))
+    // Without the dots, behind which an extension would begin.
+    format!("{}-{}", Owner::this(), COUNT.fetch_add(1, Ordering::Relaxed)).replace('.', "-")
 }

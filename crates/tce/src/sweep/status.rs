@@ -103,7 +103,7 @@ impl Sweep {
     }
 
     /// Who is at work, by the work's id.
-    pub(super) fn active(&self) -> BTreeMap<String, Vec<Active>> {
+    fn active(&self) -> BTreeMap<String, Vec<Active>> {
         let mut out: BTreeMap<String, Vec<Active>> = BTreeMap::new();
         for file in fs::read_dir(self.directory.join("active")).into_iter().flatten().flatten() {
             let modified = file.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);

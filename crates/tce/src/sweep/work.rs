@@ -2,17 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, sha256_file, write_json};
+use tce_base::{FileError, link_first, read_if_there, sha256_file, write_json};
 use tce_nn::cpu;
 
 use super::{Entry, Kind, Sweep};
+use crate::PROGRAM;
 use crate::error::{Error, Result};
 use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
@@ -126,14 +126,24 @@ impl Sweep {
     /// If the record of it is damaged.
     pub fn outcome(&self, entry: &Entry) -> Result<Option<Outcome>> {
         let path = self.file("done", &format!("{}.json", entry.id));
-        let bytes = match fs::read(&path) {
-            Ok(bytes) => bytes,
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(FileError::new(&path, "read", e).into()),
-        };
+        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
         let outcome: Outcome = serde_json::from_slice(&bytes)
             .map_err(|e| Error::Failed(format!("{}: {e}; remove it to do the work again", path.display())))?;
         Ok(Some(outcome))
+    }
+
+    /// The pieces of work that are not done, in the order of the manifest.
+    ///
+    /// # Errors
+    /// If the record of one is damaged.
+    pub fn missing(&self) -> Result<Vec<&Entry>> {
+        let mut missing = Vec::new();
+        for entry in self.entries() {
+            if self.outcome(entry)?.is_none() {
+                missing.push(entry);
+            }
+        }
+        Ok(missing)
     }
 
     /// Does a piece of work, unless it is done.
@@ -187,7 +197,7 @@ impl Sweep {
             place: place.strip_prefix(&self.directory).unwrap_or(&place).to_owned(),
             files,
             seconds: started.elapsed().as_secs_f64(),
-            program: format!("tce {}", env!("CARGO_PKG_VERSION")),
+            program: PROGRAM.into(),
         })
     }
 
@@ -199,31 +209,25 @@ impl Sweep {
         let path = self.file("done", &format!("{}.json", outcome.id));
         let own = self.file("done", &format!(".{}.{}.part", outcome.id, Owner::this()));
         write_json(&own, &outcome)?;
-        let linked = fs::hard_link(&own, &path);
-        let result = match linked {
-            Ok(()) => Ok(outcome),
-            Err(e) if e.kind() == ErrorKind::AlreadyExists => {
-                let bytes = fs::read(&path).map_err(|e| FileError::new(&path, "read", e))?;
-                match serde_json::from_slice::<Outcome>(&bytes) {
-                    Ok(first) if first.agrees(&outcome) => Ok(first),
-                    first => {
-                        let fault = self.file("faults", &format!("{}.{}.json", outcome.id, Owner::this()));
-                        write_json(&fault, &serde_json::json!({ "first": first.ok(), "later": outcome }))?;
-                        Err(Error::Failed(format!(
-                            "two copies of the work {} came to different results; the first stays, and {} holds both. This is a \
-                             fault of determinism: were they done by different builds or processors?",
-                            outcome.id,
-                            fault.display()
-                        )))
-                    }
-                }
-            }
-            // A file system without hard links.
-            Err(_) if !path.exists() => write_json(&path, &outcome).map(|()| outcome).map_err(Error::from),
-            Err(e) => Err(FileError::new(&path, "link", e).into()),
-        };
+        let first = link_first(&own, &path);
         let _ = fs::remove_file(&own);
-        result
+        if first? {
+            return Ok(outcome);
+        }
+        let bytes = fs::read(&path).map_err(|e| FileError::new(&path, "read", e))?;
+        match serde_json::from_slice::<Outcome>(&bytes) {
+            Ok(first) if first.agrees(&outcome) => Ok(first),
+            first => {
+                let fault = self.file("faults", &format!("{}.{}.json", outcome.id, Owner::this()));
+                write_json(&fault, &serde_json::json!({ "first": first.ok(), "later": outcome }))?;
+                Err(Error::Failed(format!(
+                    "two copies of the work {} came to different results; the first stays, and {} holds both. This is a \
+                     fault of determinism: were they done by different builds or processors?",
+                    outcome.id,
+                    fault.display()
+                )))
+            }
+        }
     }
 }
 
