@@ -67,6 +67,7 @@ impl NetworkConfig {
                 output: embedding,
                 activation: Activation::Silu,
                 output_activation: Activation::Silu,
+                layer_norm: false,
             }
             .init(members, &format!("{name}/{part}"), device)
         };

@@ -23,7 +23,8 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::module::Param;
 use tce_nn::{
-    Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host,
+    Activation, Averaged, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay,
+    host,
 };
 
 use crate::buffer::Buffer;
@@ -205,6 +206,16 @@ impl Actor {
         self.output(self.net.net(), s)
     }
 
+    /// A network that follows the policy, at the policy for now; [`Actor::step_averaged`] moves it.
+    pub fn follower(&self) -> Averaged<ActorNet> {
+        Averaged::new(self.net.net())
+    }
+
+    /// The action tanh μ(s) `[P, B, A]` of a [`Actor::follower`], outside of autodiff.
+    pub fn followed(&self, follower: &Averaged<ActorNet>, s: Tensor<3>) -> Tensor<3> {
+        self.output(follower.net(), s).mean
+    }
+
     /// π(·|s) outside of autodiff.
     pub fn frozen(&self, s: Tensor<3>) -> PolicyOutput {
         self.output(&self.net.net().valid(), s)
@@ -220,6 +231,11 @@ impl Actor {
         let (mean, log_std) = (out.clone().narrow(2, 0, a), out.narrow(2, a, a));
         let log_std = log_std.clamp(LOG_STD_RANGE.0, LOG_STD_RANGE.1);
         PolicyOutput { mean: mean.clone().tanh(), pre_tanh: Some((mean, log_std)), log_std: None }
+    }
+
+    /// mean over rows and components of (tanh μ(s) - a)², per member, whatever the form.
+    pub fn squared_loss(output: &PolicyOutput, a: Tensor<3>) -> Tensor<3> {
+        member_mean(squared_error(output.mean.clone(), a))
     }
 
     /// mean over rows of w · ℓ(s, a), per member. `weights` is `[P, B, 1]`; none means 1.
@@ -242,8 +258,18 @@ impl Actor {
 
     /// One optimiser step down the sum of the members' losses, at the learning rate of `step`.
     pub fn step(&mut self, loss: Tensor<3>, step: u64) {
-        let lr = if self.config.cosine { cosine_decay(self.config.lr, step, self.steps) } else { self.config.lr };
+        let lr = self.learning_rate(step);
         self.net.step(loss.sum(), lr);
+    }
+
+    /// [`Actor::step`], then `follower` a step of `rate` after the policy.
+    pub fn step_averaged(&mut self, loss: Tensor<3>, step: u64, follower: &mut Averaged<ActorNet>, rate: f64) {
+        let lr = self.learning_rate(step);
+        self.net.step_averaged(loss.sum(), lr, follower, rate);
+    }
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        if self.config.cosine { cosine_decay(self.config.lr, step, self.steps) } else { self.config.lr }
     }
 
     /// The policies as they are.

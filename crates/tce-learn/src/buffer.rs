@@ -256,6 +256,23 @@ impl Buffer {
         }
     }
 
+    /// The actions of the rows that come next `[P, B, d_a]`, and 1 where the data tell it, else 0, `[P, B, 1]`: within an
+    /// episode, if the next row begins where this one ends. Generated rows have no next one.
+    pub fn next_actions(&self, batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
+        let [p, b, a] = batch.a.dims();
+        let (mut actions, mut known) = (vec![0.0; p * b * a], vec![0.0; p * b]);
+        for (k, pick) in batch.picks.iter().enumerate() {
+            let (part, i) = (&self.members[k / b].parts[pick.part as usize], pick.row as usize);
+            let ended = part.terminals[i] || part.timeouts[i] || i + 1 == part.len();
+            if !ended && part.next_observation(i) == part.observation(i + 1) {
+                actions[k * a..(k + 1) * a].copy_from_slice(part.action(i + 1));
+                known[k] = 1.0;
+            }
+        }
+        let device = batch.a.device();
+        (tensor(actions, [p, b, a], &device), tensor(known, [p, b, 1], &device))
+    }
+
     /// Observations of member `member` as its networks see them: the inputs, standardised, row-major.
     pub fn network_inputs(&self, member: usize, observations: &[f32]) -> Vec<f32> {
         let mut out = Vec::with_capacity(observations.len() / self.obs_dim() * self.inputs.len());
@@ -395,6 +412,18 @@ mod tests {
             }
         }
         assert_eq!(batch.keep(&[vec![0, 1], vec![1, 2]]).target_rows, 2, "target rows alone");
+    }
+
+    #[test]
+    fn next_actions_stay_within_episodes() {
+        let buffer = Buffer::new(vec![member(1, vec![table()])], 40).unwrap();
+        let batch = buffer.sample(0, &cpu());
+        let (actions, known) = buffer.next_actions(&batch);
+        for ((pick, a), known) in batch.picks.iter().zip(host(actions)).zip(host(known)) {
+            // Rows 1 and 4 end their episodes, row 5 the table.
+            let expected = if [1, 4, 5].contains(&pick.row) { (0.0, 0.0) } else { (-(pick.row as f32) - 1.0, 1.0) };
+            assert_eq!((a, known), expected, "row {}", pick.row);
+        }
     }
 
     #[test]

@@ -44,9 +44,15 @@ impl Critic {
         self.online.net().valid().forward(sa)
     }
 
-    /// A step down mean w (Q(s, a) - y)², then one of Q' after Q. Returns the loss per member, `[P, 1, 1]`.
-    fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
-        let loss = squared_td_error(self.online(sa), y, w);
+    /// A step down `loss` of Q(s, a), then one of Q' after Q. Returns the loss per member, `[P, 1, 1]`.
+    fn step(
+        &mut self,
+        sa: Tensor<3>,
+        loss: &(impl Fn(Tensor<3>) -> Tensor<3> + Sync),
+        lr: f64,
+        polyak: f64,
+    ) -> Tensor<3> {
+        let loss = loss(self.online(sa));
         let value = loss.clone().inner();
         self.online.step_averaged(loss.sum(), lr, &mut self.target, polyak);
         value
@@ -63,16 +69,37 @@ impl Twins {
     /// New critics on `inputs` observations and `actions`, drawn from the members' streams `critic 1` and `critic 2`.
     /// `device` is one with autodiff.
     pub fn new(inputs: usize, actions: usize, hidden: &[usize], members: &[Streams], device: &Device) -> Self {
-        let config = MlpConfig::relu(inputs + actions, hidden, 1);
-        Self { pair: ["critic 1", "critic 2"].map(|name| Critic::new(name, &config, members, device)) }
+        Self::with(&MlpConfig::relu(inputs + actions, hidden, 1), members, device)
+    }
+
+    /// The same with any network.
+    pub fn with(config: &MlpConfig, members: &[Streams], device: &Device) -> Self {
+        Self { pair: ["critic 1", "critic 2"].map(|name| Critic::new(name, config, members, device)) }
+    }
+
+    /// min(Q₁', Q₂')(s, a), no part of autodiff.
+    pub fn lesser_target(&self, sa: Tensor<3>) -> Tensor<3> {
+        let [one, two] = &self.pair;
+        let (q1, q2) = rayon::join(|| one.target(sa.clone()), || two.target(sa.clone()));
+        q1.min_pair(q2)
     }
 
     /// A step of both towards y. `w` `[P, B, 1]` multiplies the rows. Returns the sum of the two losses per member.
     pub fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
+        self.step_down(sa, |q| squared_td_error(q, y.clone(), w.clone()), lr, polyak)
+    }
+
+    /// A step of both down `loss` of Q(s, a), per member `[P, 1, 1]`. Returns the sum of the two losses.
+    pub fn step_down(
+        &mut self,
+        sa: Tensor<3>,
+        loss: impl Fn(Tensor<3>) -> Tensor<3> + Sync,
+        lr: f64,
+        polyak: f64,
+    ) -> Tensor<3> {
         let [one, two] = &mut self.pair;
-        let (other_sa, other_y, other_w) = (sa.clone(), y.clone(), w.clone());
-        let (a, b) =
-            rayon::join(|| one.step(sa, y, w, lr, polyak), || two.step(other_sa, other_y, other_w, lr, polyak));
+        let other = sa.clone();
+        let (a, b) = rayon::join(|| one.step(sa, &loss, lr, polyak), || two.step(other, &loss, lr, polyak));
         a + b
     }
 

@@ -1,32 +1,36 @@
-//! The behaviour CVAE: a model of π_b(a|s), the policy that collected the target data (as in BCQ; OTDF, DmC and BOSA).
+//! Conditional variational autoencoders: of π_b(a|s), the policy that collected the data (as in BCQ; TCE, OTDF, DmC, BOSA), and of
+//! the dynamics p(s'|s, a) (BOSA).
 //!
 //! ```text
-//! encoder  (s, a) → 750 → 750 → (m, ln σ), ln σ clipped to [-4, 15]      latent z of 2 d_a dimensions
-//! decoder  (s, z) → 750 → 750 → tanh
-//! L = mean (decoder(s, m + σ n) - a)² + ½ KL(N(m, σ²) ‖ N(0, I))         both means over rows and dimensions
-//! draws    â = decoder(s, z), z ~ N(0, I)
+//! behaviour c = s, x = a;  dynamics c = (s, a), x = s'
+//! encoder  (c, x) → 750 → 750 → (m, ln σ), ln σ clipped to [-4, 15]      latent z of 2 dim(x) dimensions
+//! decoder  (c, z) → 750 → 750 → x; tanh for actions
+//! L = mean (decoder(c, m + σ n) - x)² + ½ KL(N(m, σ²) ‖ N(0, I))         both means over rows and dimensions
+//! draws    x̂ = decoder(c, z), z ~ N(0, I)
+//! density  ln p̂(x|c) = logsumexp over k of [Σ_d ln N(x_d; decoder(c, z_k)_d, β²) + ln N(z_k; 0, I) - ln q(z_k|c, x)] - ln K,
+//!          z_1..K ~ q = N(m, σ²)                                          (IWAE; OTDF leaves out all but the first term)
 //! ```
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
 //! | - | `hidden` | 750, 750 ReLU | OTDF |
-//! | - | `latent_per_action` | 2 | OTDF |
+//! | - | `latent_per_action` | 2 | OTDF; per dimension of x |
 //! | ½ | `kl_weight` | .5 | OTDF |
 //! | - | `lr` | 1e-3 | OTDF |
 //! | - | `steps` | 10 000 | OTDF |
-//! | - | `batch` | 128 target rows | OTDF |
+//! | - | `batch` | 128 target rows | OTDF; BOSA: rows of both domains |
 
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Activation, Checkpoints, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
+use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::blocks::map_rows;
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
-use crate::losses::{kl_to_standard_normal, member_mean, squared_error};
-use crate::training::{Learner, Meter, Steps, member_noise, train};
+use crate::losses::{kl_to_standard_normal, member_mean, normal_log_prob, squared_error};
+use crate::training::{Learner, Meter, Place, member_noise, prepare};
 
 /// Range of the posterior's ln σ.
 const LOG_STD_RANGE: (f32, f32) = (-4.0, 15.0);
@@ -37,7 +41,7 @@ const LOG_STD_RANGE: (f32, f32) = (-4.0, 15.0);
 pub struct CvaeConfig {
     /// Hidden layers of encoder and decoder.
     pub hidden: Vec<usize>,
-    /// Latent dimensions per action dimension.
+    /// Latent dimensions per dimension of what is modelled.
     pub latent_per_action: usize,
     /// Weight of the divergence.
     pub kl_weight: f64,
@@ -55,6 +59,36 @@ impl Default for CvaeConfig {
     }
 }
 
+/// What is modelled, and given what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Modelled {
+    /// a given s.
+    Behaviour,
+    /// s' given s and a.
+    Dynamics,
+}
+
+impl Modelled {
+    /// (c, x) of a batch.
+    pub fn split(self, batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
+        match self {
+            Modelled::Behaviour => (batch.s.clone(), batch.a.clone()),
+            Modelled::Dynamics => (Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2), batch.s2.clone()),
+        }
+    }
+}
+
+/// How [`Cvae::log_density`] is estimated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Density {
+    /// K
+    pub samples: usize,
+    /// β
+    pub std: f64,
+    /// With the densities of z and - ln K, as the importance-weighted bound has it; OTDF leaves them out.
+    pub importance: bool,
+}
+
 /// Encoder and decoder of a population.
 #[derive(Module, Debug)]
 pub struct Cvae {
@@ -63,16 +97,49 @@ pub struct Cvae {
 }
 
 impl Cvae {
-    /// (m, ln σ) of the posterior of z, each `[P, B, 2 d_a]`.
-    pub fn encode(&self, s: Tensor<3>, a: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
-        let out = self.encoder.forward(Tensor::cat(vec![s, a], 2));
+    /// (m, ln σ) of the posterior of z, each `[P, B, latent]`.
+    pub fn encode(&self, c: Tensor<3>, x: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
+        let out = self.encoder.forward(Tensor::cat(vec![c, x], 2));
         let z = out.dims()[2] / 2;
         (out.clone().narrow(2, 0, z), out.narrow(2, z, z).clamp(LOG_STD_RANGE.0, LOG_STD_RANGE.1))
     }
 
-    /// Actions in (-1, 1).
-    pub fn decode(&self, s: Tensor<3>, z: Tensor<3>) -> Tensor<3> {
-        self.decoder.forward(Tensor::cat(vec![s, z], 2))
+    /// x̂; actions in (-1, 1).
+    pub fn decode(&self, c: Tensor<3>, z: Tensor<3>) -> Tensor<3> {
+        self.decoder.forward(Tensor::cat(vec![c, z], 2))
+    }
+
+    /// ln p̂(x|c), `[P, B, 1]`; gradients flow to `x`. The noise is that of `step` in each member's stream `name`.
+    pub fn log_density(
+        &self,
+        c: Tensor<3>,
+        x: Tensor<3>,
+        density: Density,
+        members: &[Streams],
+        name: &str,
+        step: u64,
+    ) -> Tensor<3> {
+        let ([p, b, given], dims, k, device) = (c.dims(), x.dims()[2], density.samples, c.device());
+        let (mean, log_std) = self.encode(c.clone(), x.clone());
+        let latent = mean.dims()[2];
+        let repeat = |t: Tensor<3>, width: usize| -> Tensor<3> {
+            t.reshape([p, b, 1, width]).expand([p, b, k, width]).reshape([p, b * k, width])
+        };
+        let noise = member_noise(members, name, step, [p, b * k, latent], &device);
+        let (mean, log_std) = (repeat(mean, latent), repeat(log_std, latent));
+        let z = mean.clone() + log_std.clone().exp() * noise;
+        let decoded = self.decode(repeat(c, given), z.clone());
+        let ln_beta = Tensor::<3>::full([1, 1, dims], density.std.ln(), &device);
+        let mut term = normal_log_prob(repeat(x, dims), decoded, ln_beta);
+        if density.importance {
+            let prior = normal_log_prob(z.clone(), Tensor::zeros_like(&z), Tensor::<3>::zeros([1, 1, latent], &device));
+            term = term + prior - normal_log_prob(z, mean, log_std);
+        }
+        let term = term.reshape([p, b, k]);
+        // The greatest term taken out first, so that no exponential underflows.
+        let greatest = term.clone().inner().max_dim(2);
+        let sum = (term - greatest.clone()).exp().sum_dim(2).log() + greatest;
+        if density.importance { sum - (k as f64).ln() } else { sum }
     }
 
     /// Latent dimensions.
@@ -104,28 +171,39 @@ pub struct CvaeLearner {
     net: Trained<Cvae>,
     members: Vec<Streams>,
     config: CvaeConfig,
+    modelled: Modelled,
+    name: String,
 }
 
 impl CvaeLearner {
-    /// New networks for the members of `buffer`.
+    /// New networks for the members of `buffer`; `name` tells their random streams from those of others.
     ///
     /// # Errors
     /// If a number of the configuration is out of range.
-    pub fn new(buffer: &Buffer, config: &CvaeConfig, device: &Device) -> Result<Self, LearnError> {
+    pub fn new(
+        buffer: &Buffer,
+        config: &CvaeConfig,
+        modelled: Modelled,
+        name: &str,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
         within("cvae.lr", config.lr, 0.0..=1.0)?;
         within("cvae.kl_weight", config.kl_weight, 0.0..=1e6)?;
         within("cvae.latent_per_action", config.latent_per_action as f64, 1.0..=1e3)?;
         let (inputs, actions) = (buffer.inputs().len(), buffer.act_dim());
-        let latent = config.latent_per_action * actions;
-        let (members, device) = (buffer.streams(), device.clone().autodiff());
-        let encoder = MlpConfig::relu(inputs + actions, &config.hidden, 2 * latent);
-        let decoder =
-            MlpConfig::relu(inputs + latent, &config.hidden, actions).with_output_activation(Activation::Tanh);
-        let net = Cvae {
-            encoder: encoder.init(&members, "cvae encoder", &device),
-            decoder: decoder.init(&members, "cvae decoder", &device),
+        let (given, dims, output) = match modelled {
+            Modelled::Behaviour => (inputs, actions, Activation::Tanh),
+            Modelled::Dynamics => (inputs + actions, inputs, Activation::Identity),
         };
-        Ok(Self { net: Trained::new(net), members, config: config.clone() })
+        let latent = config.latent_per_action * dims;
+        let (members, device) = (buffer.streams(), device.clone().autodiff());
+        let encoder = MlpConfig::relu(given + dims, &config.hidden, 2 * latent);
+        let decoder = MlpConfig::relu(given + latent, &config.hidden, dims).with_output_activation(output);
+        let net = Cvae {
+            encoder: encoder.init(&members, &format!("{name} encoder"), &device),
+            decoder: decoder.init(&members, &format!("{name} decoder"), &device),
+        };
+        Ok(Self { net: Trained::new(net), members, config: config.clone(), modelled, name: name.to_owned() })
     }
 
     /// The model as it is, outside of autodiff.
@@ -136,38 +214,99 @@ impl CvaeLearner {
 
 impl Learner for CvaeLearner {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let (mean, log_std) = self.net.net().encode(batch.s.clone(), batch.a.clone());
-        let noise = member_noise(&self.members, "cvae noise", step, mean.dims(), &batch.s.device());
+        let (c, x) = self.modelled.split(batch);
+        let (mean, log_std) = self.net.net().encode(c.clone(), x.clone());
+        let noise = member_noise(&self.members, &format!("{} noise", self.name), step, mean.dims(), &x.device());
         let z = mean.clone() + log_std.clone().exp() * noise;
-        let reconstruction = member_mean(squared_error(self.net.net().decode(batch.s.clone(), z), batch.a.clone()));
+        let reconstruction = member_mean(squared_error(self.net.net().decode(c, z), x));
         let divergence = kl_to_standard_normal(mean, log_std);
-        meter.record("cvae_reconstruction", &reconstruction);
-        meter.record("cvae_divergence", &divergence);
+        if meter.active() {
+            meter.record(&format!("{}_reconstruction", self.name), &reconstruction);
+            meter.record(&format!("{}_divergence", self.name), &divergence);
+        }
         let loss = reconstruction + divergence * self.config.kl_weight;
         self.net.step(loss.sum(), self.config.lr);
     }
 
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
-        self.net.save("cvae", &mut state);
+        self.net.save(&self.name, &mut state);
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.net.load("cvae", state, path)
+        self.net.load(&self.name, state, path)
     }
 }
 
 /// Trains a behaviour CVAE on the target rows of `buffer`. None if the user interrupted it.
 ///
 /// # Errors
-/// If the configuration cannot be used.
-pub fn train_cvae(buffer: &Buffer, config: &CvaeConfig, device: &Device) -> Result<Option<Cvae>, LearnError> {
+/// If the configuration cannot be used, or a checkpoint not be read or written.
+pub fn train_cvae(
+    buffer: &Buffer,
+    config: &CvaeConfig,
+    place: Place<'_>,
+    device: &Device,
+) -> Result<Option<Cvae>, LearnError> {
     let target = buffer.target_only(config.batch)?.with_stream("cvae batch");
-    let mut learner = CvaeLearner::new(&target, config, device)?;
-    let steps = Steps::new(config.steps, 0);
-    let outcome = train(&mut learner, &target, steps, "behaviour CVAE", &mut Checkpoints::none(), device, |_, _| {
-        Ok::<_, LearnError>(())
-    })?;
-    Ok((!outcome.interrupted).then(|| learner.model()))
+    let mut learner = CvaeLearner::new(&target, config, Modelled::Behaviour, "cvae", device)?;
+    let done = prepare(&mut learner, &target, config.steps, "behaviour CVAE", place, device)?;
+    Ok(done.then(|| learner.model()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::buffer::Member;
+    use std::path::Path;
+    use std::sync::Arc;
+    use tce_data::{Standardizer, Transitions};
+    use tce_nn::{cpu, host, tensor};
+
+    /// With a decoder that ignores z, all K terms are the same normal density around its output.
+    #[test]
+    fn the_behaviour_density_follows_its_formula() {
+        let mut t = Transitions::new(2, 1);
+        t.push(&[0.0, 1.0], &[0.5], 0.0, &[0.0, 0.0], false, true);
+        let member = Member {
+            streams: Streams::new(1),
+            parts: vec![Arc::new(t)],
+            standardizer: Standardizer::identity(2),
+            reward_scale: 1.0,
+            row_scores: None,
+        };
+        let buffer = Buffer::new(vec![member], 1).unwrap();
+        let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::default() };
+        let cvae = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", &cpu()).unwrap().model();
+        let mut weights = NamedParameters::default();
+        weights.collect("cvae", &cvae);
+        let first = weights.tensors.get_mut("cvae.decoder.layers.0.weight").unwrap();
+        assert_eq!(first.0, [1, 4, 8]);
+        first.1[2 * 8..].fill(0.0);
+        // And q(z) = N(.5, 1.5²), whatever s and a.
+        weights.tensors.get_mut("cvae.encoder.layers.1.weight").unwrap().1.fill(0.0);
+        weights.tensors.get_mut("cvae.encoder.layers.1.bias").unwrap().1 = vec![0.5, 0.5, 1.5f32.ln(), 1.5f32.ln()];
+        let cvae = weights.apply("cvae", cvae, Path::new("test")).unwrap();
+
+        let s = tensor(vec![0.3, -0.4, 1.0, 2.0], [1, 2, 2], &cpu());
+        let a = tensor(vec![0.2, -0.9], [1, 2, 1], &cpu().autodiff()).require_grad();
+        let mean = host(cvae.decode(s.clone(), Tensor::zeros([1, 2, 2], &cpu())));
+        let estimate = |a: Tensor<3>, samples, importance| {
+            let density = Density { samples, std: 0.5, importance };
+            cvae.log_density(s.clone(), a, density, &buffer.streams(), "noise", 3)
+        };
+        // The weights N(z; 0, I) / q(z) have a mean of 1.
+        let bound = host(estimate(a.clone(), 20_000, true));
+        let density = estimate(a.clone(), 5, false);
+        let grads = density.clone().sum().backward();
+        let (density, gradient) = (host(density), host(a.grad(&grads).unwrap()));
+        for (i, a) in [0.2f32, -0.9].into_iter().enumerate() {
+            let z = (a - mean[i]) / 0.5;
+            let expected = 5f32.ln() - 0.5 * z * z - 0.5f32.ln() - 0.5 * (2.0 * std::f32::consts::PI).ln();
+            assert!((density[i] - expected).abs() < 1e-4, "{} is not {expected}", density[i]);
+            assert!((gradient[i] + z / 0.5).abs() < 1e-4);
+            assert!((bound[i] - (expected - 5f32.ln())).abs() < 0.05, "{} is not {}", bound[i], expected - 5f32.ln());
+        }
+    }
 }

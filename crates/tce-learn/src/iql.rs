@@ -182,6 +182,11 @@ impl Iql {
         Ok(Self { config: config.clone(), actor, value: Trained::new(value), critics, regulariser })
     }
 
+    /// V(s) `[P, B, 1]`, no part of autodiff.
+    pub fn values(&self, s: Tensor<3>) -> Tensor<3> {
+        self.value.net().valid().forward(s)
+    }
+
     /// One update of all networks. `critic_weights` `[P, B, 1]` multiply the rows of L_Q.
     pub fn step(&mut self, batch: &Minibatch, critic_weights: Option<Tensor<3>>, step: u64, meter: &mut Meter) {
         let Self { config, actor, value, critics, regulariser } = self;

@@ -8,35 +8,57 @@
 //! | weighted imitation of actions | [`actor`], [`losses`] |
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
+//! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
+//! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`] |
+//! | choosing among a batch's rows | [`selection`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
 
 pub mod actor;
 pub mod bc;
 mod blocks;
+pub mod bosa;
 mod buffer;
 pub mod critic;
 pub mod cvae;
+pub mod dara;
+pub mod deterministic;
 mod error;
+pub mod igdf;
 pub mod import;
 pub mod iql;
 pub mod labels;
 pub mod losses;
+mod mode;
+pub mod otdf;
 pub mod pair_model;
 mod policy;
+pub mod rebrac;
 pub mod regulariser;
 pub mod sac;
+pub mod selection;
+pub mod srpo;
+pub mod td3_bc;
 mod training;
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
 pub use blocks::map_rows;
+pub use bosa::{Bosa, BosaConfig};
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};
+pub use dara::{Dara, DaraConfig};
 pub use error::LearnError;
+pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, train_labels};
+pub use mode::Mode;
+pub use otdf::{Otdf, OtdfConfig};
 pub use policy::{Head, LOG_STD_RANGE, Policy, PolicySpec};
+pub use rebrac::{Rebrac, RebracConfig};
 pub use regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
+pub use srpo::{Srpo, SrpoConfig};
+pub use td3_bc::{Td3Bc, Td3BcConfig};
 pub use training::{
-    Lane, Learner, Meter, Outcome, PolicyLearner, Report, Steps, member_noise, train, train_side_by_side,
+    Lane, Learner, Meter, Outcome, Place, PolicyLearner, Report, Steps, member_noise, prepare, train,
+    train_side_by_side,
 };

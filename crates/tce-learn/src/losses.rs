@@ -6,6 +6,7 @@
 //! | [`advantage_weights`] | min(exp(β u / scale), cap) | IQL Eq. 7; B.14 |
 //! | [`squared_error`] | (mean - a)², per component | OTDF's log-likelihood of a deterministic policy, up to constants |
 //! | [`normal_log_prob`] | Σ_d ln N(x_d; mean_d, σ_d²) | - |
+//! | [`binary_cross_entropy`] | mean of ln(1 + e^x) - label x | - |
 //! | [`kl_to_standard_normal`] | -½ mean(1 + 2 ln σ - μ² - σ²) | BCQ's CVAE |
 
 use serde::{Deserialize, Serialize};
@@ -85,6 +86,13 @@ pub fn squared_td_error(q: Tensor<3>, y: Tensor<3>, weights: Option<Tensor<3>>) 
     })
 }
 
+/// Binary cross-entropy of logits `[P, B, 1]` against labels in [0, 1], mean over rows: ln(1 + e^x) - label x.
+pub fn binary_cross_entropy(logits: Tensor<3>, labels: Tensor<3>) -> Tensor<3> {
+    // ln(1 + e^x) = max(x, 0) + ln(1 + e^-|x|): no exponential overflows.
+    let softplus = logits.clone().clamp_min(0.0) + (-logits.clone().abs()).exp().log1p();
+    member_mean(softplus - logits * labels)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -131,6 +139,13 @@ mod tests {
         close(advantage_weights(column(&u), weights(AdvantageScale::Standardised)), &expected);
         let constant = advantage_weights(column(&[0.0, 0.0]), weights(AdvantageScale::Standardised));
         close(constant, &[1.0, 1.0]);
+    }
+
+    #[test]
+    fn cross_entropy_of_logits() {
+        // -ln σ(2), -ln(1 - σ(-1)), and a logit whose exponential overflows.
+        let loss = binary_cross_entropy(column(&[2.0, -1.0, 200.0]), column(&[1.0, 0.0, 0.0]));
+        close(loss, &[((-2f32).exp().ln_1p() + (-1f32).exp().ln_1p() + 200.0) / 3.0]);
     }
 
     #[test]

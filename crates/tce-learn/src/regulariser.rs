@@ -23,10 +23,10 @@ use tce_nn::{Device, Tensor, tensor};
 
 use crate::actor::{Actor, PolicyOutput};
 use crate::buffer::{Buffer, Minibatch};
-use crate::cvae::{Cvae, CvaeConfig, train_cvae};
+use crate::cvae::{Cvae, CvaeConfig, Density, train_cvae};
 use crate::error::LearnError;
-use crate::losses::{member_mean, normal_log_prob};
-use crate::training::member_noise;
+use crate::losses::member_mean;
+use crate::training::Place;
 
 /// Which term; see the [module](self).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -89,11 +89,12 @@ impl Regulariser {
     /// Trains what the term needs, on the target rows of `buffer`. None if the user interrupted it.
     ///
     /// # Errors
-    /// If the configuration cannot be used.
+    /// If the configuration cannot be used, or a checkpoint not be read or written.
     pub fn prepare(
         kind: RegulariserKind,
         buffer: &Buffer,
         config: &RegulariserConfig,
+        place: Place<'_>,
         device: &Device,
     ) -> Result<Option<Self>, LearnError> {
         if kind == RegulariserKind::None {
@@ -108,7 +109,7 @@ impl Regulariser {
                 "correct the configuration",
             ));
         }
-        let Some(cvae) = train_cvae(buffer, &config.cvae, device)? else { return Ok(None) };
+        let Some(cvae) = train_cvae(buffer, &config.cvae, place, device)? else { return Ok(None) };
         Ok(Some(match kind {
             RegulariserKind::Otdf => {
                 Self::Otdf { cvae, samples: config.samples, std: config.std, members: buffer.streams() }
@@ -155,81 +156,10 @@ impl Regulariser {
             }
             Self::Otdf { cvae, samples, std, members } => {
                 let action = output.sample(members, step);
-                Some(-member_mean(behaviour_log_density(cvae, batch.s.clone(), action, *samples, *std, members, step)))
+                let density = Density { samples: *samples, std: *std, importance: false };
+                let s = batch.s.clone();
+                Some(-member_mean(cvae.log_density(s, action, density, members, "regulariser noise", step)))
             }
-        }
-    }
-}
-
-/// OTDF's log β(a|s), `[P, B, 1]`; gradients flow to `a`.
-fn behaviour_log_density(
-    cvae: &Cvae,
-    s: Tensor<3>,
-    a: Tensor<3>,
-    samples: usize,
-    std: f64,
-    members: &[Streams],
-    step: u64,
-) -> Tensor<3> {
-    let ([p, b, inputs], actions) = (s.dims(), a.dims()[2]);
-    let (mean, log_std) = cvae.encode(s.clone(), a.clone());
-    let latent = mean.dims()[2];
-    let repeat = |x: Tensor<3>, width: usize| -> Tensor<3> {
-        x.reshape([p, b, 1, width]).expand([p, b, samples, width]).reshape([p, b * samples, width])
-    };
-    let noise = member_noise(members, "regulariser noise", step, [p, b * samples, latent], &s.device());
-    let z = repeat(mean, latent) + repeat(log_std.exp(), latent) * noise;
-    let decoded = cvae.decode(repeat(s.clone(), inputs), z);
-    let log_std = Tensor::<3>::full([1, 1, actions], std.ln(), &s.device());
-    let log_prob = normal_log_prob(repeat(a, actions), decoded, log_std).reshape([p, b, samples]);
-    // The greatest term taken out first, so that no exponential underflows.
-    let greatest = log_prob.clone().inner().max_dim(2);
-    (log_prob - greatest.clone()).exp().sum_dim(2).log() + greatest
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::buffer::Member;
-    use crate::cvae::CvaeLearner;
-    use std::path::Path;
-    use std::sync::Arc;
-    use tce_data::{Standardizer, Transitions};
-    use tce_nn::{NamedParameters, cpu, host};
-
-    /// With a decoder that ignores z, all K terms are the same normal density around its output.
-    #[test]
-    fn the_behaviour_density_follows_its_formula() {
-        let mut t = Transitions::new(2, 1);
-        t.push(&[0.0, 1.0], &[0.5], 0.0, &[0.0, 0.0], false, true);
-        let member = Member {
-            streams: Streams::new(1),
-            parts: vec![Arc::new(t)],
-            standardizer: Standardizer::identity(2),
-            reward_scale: 1.0,
-            row_scores: None,
-        };
-        let buffer = Buffer::new(vec![member], 1).unwrap();
-        let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::default() };
-        let cvae = CvaeLearner::new(&buffer, &config, &cpu()).unwrap().model();
-        let mut weights = NamedParameters::default();
-        weights.collect("cvae", &cvae);
-        let first = weights.tensors.get_mut("cvae.decoder.layers.0.weight").unwrap();
-        assert_eq!(first.0, [1, 4, 8]);
-        first.1[2 * 8..].fill(0.0);
-        let cvae = weights.apply("cvae", cvae, Path::new("test")).unwrap();
-
-        let s = tensor(vec![0.3, -0.4, 1.0, 2.0], [1, 2, 2], &cpu());
-        let a = tensor(vec![0.2, -0.9], [1, 2, 1], &cpu().autodiff()).require_grad();
-        let mean = host(cvae.decode(s.clone(), Tensor::zeros([1, 2, 2], &cpu())));
-        let density = behaviour_log_density(&cvae, s, a.clone(), 5, 0.5, &buffer.streams(), 3);
-        let grads = density.clone().sum().backward();
-        let (density, gradient) = (host(density), host(a.grad(&grads).unwrap()));
-        for (i, a) in [0.2f32, -0.9].into_iter().enumerate() {
-            let z = (a - mean[i]) / 0.5;
-            let expected = 5f32.ln() - 0.5 * z * z - 0.5f32.ln() - 0.5 * (2.0 * std::f32::consts::PI).ln();
-            assert!((density[i] - expected).abs() < 1e-4, "{} is not {expected}", density[i]);
-            assert!((gradient[i] + z / 0.5).abs() < 1e-4);
         }
     }
 }

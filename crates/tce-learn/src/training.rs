@@ -17,6 +17,68 @@ const METER_EVERY: u64 = 10;
 /// Steps of a lane before the next one's turn.
 const TURN: u64 = 50;
 
+/// Where a training keeps its checkpoints, and what tells it from others.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'a> {
+    /// The directory; none keeps nothing, for trainings of seconds and tests.
+    pub directory: Option<&'a Path>,
+    /// A word that stands for all that decides the result.
+    pub key: &'a str,
+    /// Which of several trainings side by side.
+    pub lane: usize,
+}
+
+/// How the checkpoints of [`prepare`] begin.
+const PREPARATION: &str = "prepare";
+
+impl Place<'_> {
+    /// Nothing is kept.
+    pub const NONE: Place<'static> = Place { directory: None, key: "", lane: 0 };
+
+    /// The checkpoints of the training `name` here.
+    ///
+    /// # Errors
+    /// If there are some that cannot be read.
+    pub fn checkpoints(&self, name: &str) -> Result<Checkpoints, LearnError> {
+        Ok(match self.directory {
+            Some(directory) => Checkpoints::open(directory, name, self.key)?,
+            None => Checkpoints::none(),
+        })
+    }
+
+    /// Removes what [`prepare`] kept, for all lanes: the result is on disk.
+    pub fn discard_preparations(&self) {
+        let entries = self.directory.and_then(|d| std::fs::read_dir(d).ok());
+        for entry in entries.into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            if name.starts_with(PREPARATION) && name.ends_with(".checkpoint") {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+/// Trains what a learner needs before its first step: `steps` steps on `buffer`, gone on with from the checkpoints at `place`, where
+/// the end is kept too. False if the user interrupted it.
+///
+/// # Errors
+/// If a checkpoint cannot be read or written.
+pub fn prepare<L: Learner>(
+    learner: &mut L,
+    buffer: &Buffer,
+    steps: u64,
+    label: &str,
+    place: Place<'_>,
+    device: &Device,
+) -> Result<bool, LearnError> {
+    let name = format!("{PREPARATION}-{}-{}", label.replace(' ', "-"), place.lane);
+    let mut checkpoints = place.checkpoints(&name)?;
+    let mut lanes = [Lane { learner, buffer }];
+    let nothing = |_: usize, _: &Report, _: &L| Ok::<_, LearnError>(());
+    Ok(!advance(&mut lanes, Steps::new(steps, 0), label, &mut checkpoints, true, device, nothing)?.interrupted)
+}
+
 /// Something that is trained one minibatch at a time, P members at once.
 pub trait Learner: Send {
     /// One step. `step` counts from 0; figures go to `meter`.
@@ -216,6 +278,20 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     label: &str,
     checkpoints: &mut Checkpoints,
     device: &Device,
+    on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
+) -> Result<Outcome, E> {
+    advance(lanes, steps, label, checkpoints, false, device, on_report)
+}
+
+/// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own; its last report is not
+/// given again then.
+fn advance<L: Learner + ?Sized, E: From<LearnError>>(
+    lanes: &mut [Lane<L>],
+    steps: Steps,
+    label: &str,
+    checkpoints: &mut Checkpoints,
+    keep_end: bool,
+    device: &Device,
     mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
     let mut runs: Vec<_> = lanes.iter_mut().map(|lane| Run { lane, meter: Meter::default(), next: None }).collect();
@@ -226,14 +302,13 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
         }
         step = at;
     }
+    let begun = step;
     let total = steps.to.saturating_sub(step) * runs.len() as u64;
     let progress = Progress::new(label, total, "steps");
     while step < steps.to {
         let stop = interrupted();
         if step > steps.from && (stop || checkpoints.due()) {
-            let mut state = NamedParameters::default();
-            runs.iter().enumerate().for_each(|(k, run)| run.keep(k, &mut state));
-            checkpoints.keep(step, state).map_err(LearnError::from)?;
+            checkpoints.keep(step, state_of(&runs)).map_err(LearnError::from)?;
         }
         if stop {
             return Ok(Outcome { step, interrupted: true });
@@ -256,7 +331,17 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
         }
     }
     progress.finish();
+    if keep_end && begun < steps.to {
+        checkpoints.keep(steps.to, state_of(&runs)).map_err(LearnError::from)?;
+    }
     Ok(Outcome { step: steps.to.max(steps.from), interrupted: false })
+}
+
+/// The state of all lanes.
+fn state_of<L: Learner + ?Sized>(runs: &[Run<L>]) -> NamedParameters {
+    let mut state = NamedParameters::default();
+    runs.iter().enumerate().for_each(|(k, run)| run.keep(k, &mut state));
+    state
 }
 
 /// A lane under way.

@@ -10,7 +10,7 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Policy, PolicyLearner, Steps,
+    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Place, Policy, PolicyLearner, Steps,
     best_trajectories, train, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
@@ -212,7 +212,7 @@ fn regularisers_pull_the_policy_to_the_target_behaviour() {
     let mut config = RegulariserConfig { samples: 3, draws: 2, ..RegulariserConfig::default() };
     (config.cvae.hidden, config.cvae.steps) = (vec![32], 400);
     let actions = |kind, beta_reg| -> Vec<f32> {
-        let regulariser = Regulariser::prepare(kind, &buffer, &config, &cpu()).unwrap().unwrap();
+        let regulariser = Regulariser::prepare(kind, &buffer, &config, Place::NONE, &cpu()).unwrap().unwrap();
         let iql = IqlConfig { regulariser: kind, beta_reg, ..corridor_config() };
         let mut iql = Iql::new(&buffer, &iql, regulariser, 500, &cpu()).unwrap();
         run(&mut iql, &buffer, 500);

@@ -101,6 +101,8 @@ pub struct MlpConfig {
     pub activation: Activation,
     /// Of the output layer.
     pub output_activation: Activation,
+    /// Whether every hidden layer is normalised, behind its activation.
+    pub layer_norm: bool,
 }
 
 impl MlpConfig {
@@ -112,7 +114,13 @@ impl MlpConfig {
             output,
             activation: Activation::Relu,
             output_activation: Activation::Identity,
+            layer_norm: false,
         }
+    }
+
+    /// The same with layer normalisation.
+    pub fn with_layer_norm(self) -> Self {
+        Self { layer_norm: true, ..self }
     }
 
     /// The same with another activation in the hidden layers.
@@ -135,7 +143,9 @@ impl MlpConfig {
         }
         let last = format!("{name}/{}", self.hidden.len());
         layers.push(Dense::new(members, &last, width, self.output, self.output_activation, device));
-        Mlp { layers }
+        let normalised = if self.layer_norm { self.hidden.as_slice() } else { &[] };
+        let norms = normalised.iter().map(|&width| LayerNorm::new(members.len(), width, device)).collect();
+        Mlp { layers, norms }
     }
 }
 
@@ -144,12 +154,20 @@ impl MlpConfig {
 pub struct Mlp {
     /// From input to output.
     pub layers: Vec<Dense>,
+    /// Behind the hidden layers; none without layer normalisation.
+    norms: Vec<LayerNorm>,
 }
 
 impl Mlp {
     /// `[P, B, input]` → `[P, B, output]`; fewer input members are shared between neighbouring networks.
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        self.layers.iter().fold(x, |x, layer| layer.forward(x))
+        self.layers.iter().enumerate().fold(x, |x, (k, layer)| {
+            let y = layer.forward(x);
+            match self.norms.get(k) {
+                Some(norm) => norm.forward(y),
+                None => y,
+            }
+        })
     }
 }
 
@@ -168,6 +186,20 @@ mod tests {
         let x = Tensor::<3>::ones([1, 7, 5], &device);
         let y = host(all.forward(x.clone()));
         assert_eq!(y[7 * 3..2 * 7 * 3], host(one.forward(x)));
+    }
+
+    #[test]
+    fn hidden_layers_may_be_normalised() {
+        let (device, members) = (cpu(), [Streams::new(1)]);
+        let config = MlpConfig::relu(3, &[8, 8], 2);
+        let x = Tensor::<3>::from_floats([[[0.3, -1.0, 2.0], [1.0, 0.0, 5.0]]], &device);
+        let (plain, normalised) =
+            (config.init(&members, "q", &device), config.clone().with_layer_norm().init(&members, "q", &device));
+        let norm = LayerNorm::new(1, 8, &device).valid();
+        let h = norm.forward(plain.layers[0].forward(x.clone()));
+        let h = norm.forward(plain.layers[1].forward(h));
+        assert_eq!(host(normalised.forward(x.clone())), host(plain.layers[2].forward(h)));
+        assert_ne!(host(normalised.forward(x.clone())), host(plain.forward(x)));
     }
 
     #[test]

@@ -16,16 +16,19 @@ use tce_diffusion::{
     Denoiser, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, TrainConfig, Trainer,
     uniform_labels,
 };
-use tce_learn::cvae::{CvaeConfig, CvaeLearner};
+use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{
-    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, Regulariser,
-    RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
+    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, Place,
+    Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
 use tce_nn::{Checkpoints, cpu, product_rate, tensor};
 use tce_sim::{CollectOptions, UniformActor, collect};
 
+use crate::config::Algorithm;
 use crate::error::Result;
+use crate::layers::{Layered, Preset};
+use crate::methods::build;
 
 /// HalfCheetah's observations and actions, the hidden width, and rows per batch.
 const OBS: usize = 17;
@@ -57,6 +60,13 @@ const WORKLOADS: &[Workload] = &[
     ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", || iql(1, RegulariserKind::None)),
     ("iql-5", "the same, five seeds side by side (members' updates)", || iql(5, RegulariserKind::None)),
     ("iql-kl", "IQL with the forward-KL term of Eq. 10", || iql(1, RegulariserKind::ForwardKl)),
+    ("dara", "DARA, the same sizes", || method(Algorithm::Dara)),
+    ("bosa", "BOSA", || method(Algorithm::Bosa)),
+    ("srpo", "SRPO", || method(Algorithm::Srpo)),
+    ("igdf", "IGDF", || method(Algorithm::Igdf)),
+    ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", || method(Algorithm::Otdf)),
+    ("td3-bc", "TD3+BC", || method(Algorithm::Td3Bc)),
+    ("rebrac", "ReBRAC", || method(Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
@@ -174,12 +184,15 @@ fn members(seeds: u64) -> Vec<Member> {
 }
 
 /// Ten steps a call of learners side by side, as [`crate::learning`] trains them.
-fn learning<L: Learner + 'static>(lanes: Vec<(Buffer, L)>, flops: f64) -> Body {
-    let (buffers, mut learners): (Vec<_>, Vec<L>) = lanes.into_iter().unzip();
+fn learning<L: Learner + ?Sized + 'static>(lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+    let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = lanes.into_iter().unzip();
     let mut from = 0;
     Body::new("updates", 10.0 * learners.len() as f64, flops, move || {
-        let mut lanes: Vec<_> =
-            learners.iter_mut().zip(&buffers).map(|(learner, buffer)| Lane { learner, buffer }).collect();
+        let mut lanes: Vec<_> = learners
+            .iter_mut()
+            .zip(&buffers)
+            .map(|(learner, buffer)| Lane { learner: learner.as_mut(), buffer })
+            .collect();
         let steps = Steps { from, to: from + 10, report_every: 0 };
         let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &cpu(), |_, _, _| {
             Ok::<_, LearnError>(())
@@ -203,10 +216,11 @@ fn iql(seeds: u64, kind: RegulariserKind) -> Body {
     };
     let lane = |member: Member| {
         let buffer = Buffer::new(vec![member], BATCH).expect("good data");
-        let regulariser =
-            Regulariser::prepare(kind, &buffer, &small, &cpu()).expect("defaults").expect("not interrupted");
+        let regulariser = Regulariser::prepare(kind, &buffer, &small, Place::NONE, &cpu())
+            .expect("defaults")
+            .expect("not interrupted");
         let learner = Iql::new(&buffer, &config, regulariser, 1 << 40, &cpu()).expect("defaults");
-        (buffer, learner)
+        (buffer, Box::new(learner))
     };
     let ((v, v1), (q, q1), (pi, pi1)) = (
         row_products(&[OBS, WIDTH, WIDTH, 1]),
@@ -225,25 +239,38 @@ fn sac() -> Body {
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, 2 * ACT]);
     // Policy at s' and s, with its gradient; critics: target, online, gradient, and to the action and back.
     let products = (4.0 * pi - pi1) + 2.0 * (q + 3.0 * q - q1 + 2.0 * q);
-    learning(vec![(buffer, learner)], 2.0 * BATCH as f64 * products)
+    learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * products)
+}
+
+/// A method as the default preset has it, with target and source rows; what it trains before its first step is not timed.
+fn method(algorithm: Algorithm) -> Body {
+    let layered = Layered::new(Preset::Default, None, None, None, &[]);
+    let mut config = layered.and_then(|l| l.config()).expect("the default preset").learner;
+    (config.algorithm, config.iql.regulariser) = (algorithm, RegulariserKind::None);
+    (config.behaviour.cvae.steps, config.igdf.steps, config.bosa.cvae.steps) = (1, 1, 1);
+    let mut member = members(1).remove(0);
+    member.row_scores = Some(Arc::new((0..member.parts[1].len()).map(|i| (i % 97) as f32).collect()));
+    let buffer = Buffer::new(vec![member], BATCH).expect("good data");
+    let learner = build(&buffer, &config, Place::NONE, &cpu()).expect("defaults");
+    learning(vec![(buffer, learner)], 0.0)
 }
 
 fn bc() -> Body {
     let buffer = Buffer::new(members(1), BATCH).expect("good data");
     let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, &cpu()).expect("defaults");
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, ACT]);
-    learning(vec![(buffer, learner)], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
+    learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
 }
 
 fn cvae() -> Body {
     let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::default() };
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(config.batch).expect("target rows");
-    let learner = CvaeLearner::new(&buffer, &config, &cpu()).expect("defaults");
+    let learner = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", &cpu()).expect("defaults");
     let latent = config.latent_per_action * ACT;
     let (encoder, first) = row_products(&[OBS + ACT, WIDTH, WIDTH, 2 * latent]);
     let (decoder, _) = row_products(&[OBS + latent, WIDTH, WIDTH, ACT]);
     let flops = 2.0 * config.batch as f64 * (3.0 * (encoder + decoder) - first);
-    learning(vec![(buffer, learner)], flops)
+    learning(vec![(buffer, Box::new(learner))], flops)
 }
 
 fn labels() -> Body {
@@ -258,7 +285,7 @@ fn labels() -> Body {
         let (all, first) = row_products(&widths);
         3.0 * all - first
     };
-    learning(vec![(buffer, models)], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
+    learning(vec![(buffer, Box::new(models))], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
 }
 
 /// Multiply-adds per row of a score network: all of it, and what is left of it when time and condition are put in.

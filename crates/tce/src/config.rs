@@ -4,7 +4,10 @@
 use serde::{Deserialize, Serialize};
 use tce_data::ScoreTable;
 use tce_diffusion::{Process, Sampler, Schedule, Target};
-use tce_learn::{BcConfig, IqlConfig, LabelConfig, RegulariserConfig, RegulariserKind};
+use tce_learn::{
+    BcConfig, BosaConfig, DaraConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, Mode, OtdfConfig, RebracConfig,
+    RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+};
 
 use crate::error::{Error, Result};
 
@@ -107,17 +110,31 @@ pub struct MixtureConfig {
     pub lambda: f64,
 }
 
-/// Which algorithm learns the policy.
+/// Which algorithm learns the policy; what each of them is, `tce learn --list` tells ([`crate::methods`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum Algorithm {
     /// Behaviour cloning.
     Bc,
     /// Implicit Q-learning.
     Iql,
+    /// TD3+BC.
+    Td3Bc,
+    /// ReBRAC.
+    Rebrac,
+    /// DARA, on IQL.
+    Dara,
+    /// SRPO, on IQL.
+    Srpo,
+    /// IGDF, on IQL.
+    Igdf,
+    /// OTDF, on IQL.
+    Otdf,
+    /// BOSA.
+    Bosa,
 }
 
-/// The learner; the keys of the other algorithm are not looked at.
+/// The learner; the keys of algorithms that are not trained are not looked at.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
@@ -129,29 +146,84 @@ pub struct LearnerConfig {
     pub top: f64,
     pub iql: IqlConfig,
     pub bc: BcConfig,
+    pub td3_bc: Td3BcConfig,
+    pub rebrac: RebracConfig,
+    pub dara: DaraConfig,
+    pub srpo: SrpoConfig,
+    pub igdf: IgdfConfig,
+    pub otdf: OtdfConfig,
+    pub bosa: BosaConfig,
     pub behaviour: RegulariserConfig,
 }
 
 impl LearnerConfig {
+    /// The IQL that the algorithm stands on, where it does.
+    pub fn backbone(&self) -> Option<IqlConfig> {
+        match self.algorithm {
+            Algorithm::Iql | Algorithm::Dara | Algorithm::Srpo | Algorithm::Igdf => Some(self.iql.clone()),
+            Algorithm::Otdf => Some(self.otdf.backbone(&self.iql)),
+            Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa => None,
+        }
+    }
+
+    /// The algorithm's own table, and its name.
+    fn own(&self) -> (&'static str, serde_json::Value) {
+        use serde_json::json;
+        match self.algorithm {
+            Algorithm::Bc => ("bc", json!(self.bc)),
+            Algorithm::Iql => ("iql", json!(self.iql)),
+            Algorithm::Td3Bc => ("td3_bc", json!(self.td3_bc)),
+            Algorithm::Rebrac => ("rebrac", json!(self.rebrac)),
+            Algorithm::Dara => ("dara", json!(self.dara)),
+            Algorithm::Srpo => ("srpo", json!(self.srpo)),
+            Algorithm::Igdf => ("igdf", json!(self.igdf)),
+            Algorithm::Otdf => ("otdf", json!(self.otdf)),
+            Algorithm::Bosa => ("bosa", json!(self.bosa)),
+        }
+    }
+
+    /// Whether the method is trained as its public code has it, where that differs from its paper; None where there is one form.
+    pub fn mode(&self) -> Option<Mode> {
+        serde_json::from_value(self.own().1.get("mode")?.clone()).ok()
+    }
+
     /// The keys that the algorithm looks at: what a run's identity depends on.
     pub fn used(&self) -> serde_json::Value {
-        let Self { algorithm, steps, batch, standardise, top, iql, bc, behaviour } = self;
+        let Self { algorithm, steps, batch, standardise, .. } = self;
         let mut used = serde_json::json!({
             "algorithm": algorithm, "steps": steps, "batch": batch, "standardise": standardise,
         });
-        match algorithm {
-            Algorithm::Bc => {
-                used["top"] = serde_json::json!(top);
-                used["bc"] = serde_json::json!(bc);
+        let (name, own) = self.own();
+        used[name] = own;
+        if *algorithm == Algorithm::Bc {
+            used["top"] = serde_json::json!(self.top);
+        }
+        if let Some(iql) = self.backbone() {
+            if iql.regulariser != RegulariserKind::None {
+                used["behaviour"] = serde_json::json!(self.behaviour);
             }
-            Algorithm::Iql => {
-                used["iql"] = serde_json::json!(iql);
-                if iql.regulariser != RegulariserKind::None {
-                    used["behaviour"] = serde_json::json!(behaviour);
-                }
-            }
+            used["iql"] = serde_json::json!(iql);
         }
         used
+    }
+
+    fn check(&self) -> Result<()> {
+        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, .. } = self;
+        let iql = self.backbone().unwrap_or_else(|| iql.clone());
+        let checks = [
+            ("iql", iql.check()),
+            ("td3_bc", td3_bc.check()),
+            ("rebrac", rebrac.check()),
+            ("dara", dara.check()),
+            ("srpo", srpo.check()),
+            ("igdf", igdf.check()),
+            ("otdf", otdf.check()),
+            ("bosa", bosa.check()),
+        ];
+        let named = |(name, check): (&str, std::result::Result<(), LearnError>)| {
+            check.map_err(|e| Error::Usage(format!("learner.{name}: {e}")))
+        };
+        checks.into_iter().try_for_each(named)
     }
 }
 
@@ -195,7 +267,7 @@ impl Config {
         }
         self.generator.process.check().map_err(|e| Error::Usage(format!("generator.process: {e}")))?;
         self.generator.sampler.check().map_err(|e| Error::Usage(format!("generator.sampler: {e}")))?;
-        self.learner.iql.check().map_err(|e| Error::Usage(format!("learner.iql: {e}")))
+        self.learner.check()
     }
 
     /// As TOML, for a run's directory.

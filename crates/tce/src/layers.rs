@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Quality, Shift};
 use toml::{Table, Value};
 
-use crate::config::Config;
+use crate::config::{Algorithm, Config};
 use crate::error::{Error, Result};
 use crate::task::Task;
 use crate::variant::Variant;
@@ -72,7 +72,11 @@ impl Layered {
         }
         if let Some(variant) = variant {
             let name = format!("variant {variant}");
-            layered.merge_into(parse(&variant.layer(layered.lambda_of_paper(task)), &name)?, &name, Some(&known))?;
+            layered.merge_into(
+                parse(&variant.layer(layered.lambda_of_paper(task), task.map(|t| t.shift)), &name)?,
+                &name,
+                Some(&known),
+            )?;
         }
         if let Some(path) = file {
             let name = path.display().to_string();
@@ -223,6 +227,12 @@ pub struct ConfigArgs {
 }
 
 impl ConfigArgs {
+    /// The same with another learner, if one is given.
+    pub fn with_learner(mut self, learner: Option<Algorithm>) -> Self {
+        self.sets.extend(learner.map(|l| format!("learner.algorithm={:?}", l.method().name)));
+        self
+    }
+
     /// The layers for `task` and `variant`.
     pub fn layered(&self, task: Option<Task>, variant: Option<Variant>) -> Result<Layered> {
         Layered::new(self.preset, task, variant, self.config.as_deref(), &self.sets)
@@ -232,7 +242,6 @@ impl ConfigArgs {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Algorithm;
     use tce_diffusion::Process;
 
     fn layered(preset: Preset, task: Option<&str>, sets: &[&str]) -> Result<Layered> {

@@ -9,15 +9,16 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::{
-    Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
-    return_range_scale, train_side_by_side,
+    Buffer, Lane, Member, Place, Policy, PolicyLearner, RewardScale, Steps, best_trajectories, return_range_scale,
+    train_side_by_side,
 };
-use tce_nn::{Checkpoints, Device, is_cpu};
+use tce_nn::{Device, is_cpu};
 use tce_sim::SimError;
 
 use crate::actors::{Arena, Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
+use crate::methods::build;
 use crate::metrics::Metrics;
 use crate::units::even_standardizer;
 
@@ -34,15 +35,6 @@ pub struct MemberData {
     pub row_scores: Option<Arc<Vec<f32>>>,
     /// Tables with real trajectories, whose returns the reward scale is taken from.
     pub trajectories: Vec<Arc<Transitions>>,
-}
-
-/// Where metrics and checkpoints are kept, and what tells this learning from others.
-#[derive(Clone, Copy, Debug)]
-pub struct Place<'a> {
-    /// The directory.
-    pub directory: &'a Path,
-    /// A word that stands for all that decides the result.
-    pub key: &'a str,
 }
 
 /// What learning leaves behind besides the policies.
@@ -64,32 +56,34 @@ impl Learned {
 }
 
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
-/// policy is the same. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
+/// policy is the same. Metrics and checkpoints are kept in a directory, beside a word that stands for all that decides the result. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
 /// whatever happens then.
 pub fn learn(
     data: Vec<MemberData>,
     config: &LearnerConfig,
     evaluation: &EvaluationConfig,
     arena: Option<Arena>,
-    place: Place<'_>,
+    (directory, key): (&Path, &str),
     device: &Device,
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<Learned> {
     let started = std::time::Instant::now();
+    let place = Place { directory: Some(directory), key, lane: 0 };
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
     let size = if is_cpu(device) { 1 } else { data.len().max(1) };
-    let lanes = data.par_chunks(size).map(|data| lane(data, config, device)).collect::<Result<Vec<_>>>()?;
+    let start = |(lane_number, data)| lane(data, config, Place { lane: lane_number, ..place }, device);
+    let lanes = data.par_chunks(size).enumerate().map(start).collect::<Result<Vec<_>>>()?;
     drop(data);
     let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
     let mut lanes: Vec<_> =
         learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
     let steps = Steps::new(config.steps, (config.steps / 50).max(1));
-    let label = format!("learn {} {seeds:?}", label(config.algorithm));
+    let label = format!("learn {} {seeds:?}", config.algorithm.method().name);
     let mut learned = Learned::default();
     let due = |step: u64| step < config.steps && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
-    let mut checkpoints = Checkpoints::open(place.directory, "learner", place.key)?;
+    let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
-    let metrics = &mut Metrics::resume(place.directory, |_, at| at <= from)?;
+    let metrics = &mut Metrics::resume(directory, |_, at| at <= from)?;
     // The number of the last evaluation, which came with the last report.
     let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
     let mut judged = vec![number(from - from % steps.report_every); lanes.len()];
@@ -127,29 +121,21 @@ pub fn learn(
     }
     learned.seconds = started.elapsed().as_secs_f64();
     checkpoints.remove();
+    place.discard_preparations();
     Ok(learned)
 }
 
 /// The members of `data` as one training, before its first step.
-fn lane(data: &[MemberData], config: &LearnerConfig, device: &Device) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
+fn lane(
+    data: &[MemberData],
+    config: &LearnerConfig,
+    place: Place<'_>,
+    device: &Device,
+) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
     let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
     let buffer = Buffer::new(members, config.batch)?;
-    let learner: Box<dyn PolicyLearner> = match config.algorithm {
-        Algorithm::Bc => Box::new(Bc::new(&buffer, &config.bc, config.steps, device)?),
-        Algorithm::Iql => {
-            let regulariser = Regulariser::prepare(config.iql.regulariser, &buffer, &config.behaviour, device)?;
-            let regulariser = regulariser.ok_or(Error::Interrupted)?;
-            Box::new(Iql::new(&buffer, &config.iql, regulariser, config.steps, device)?)
-        }
-    };
+    let learner = build(&buffer, config, place, device)?;
     Ok((buffer, learner))
-}
-
-fn label(algorithm: Algorithm) -> &'static str {
-    match algorithm {
-        Algorithm::Bc => "bc",
-        Algorithm::Iql => "iql",
-    }
 }
 
 fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
@@ -161,7 +147,7 @@ fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
         true => even_standardizer(&target, data.extra.as_deref()),
         false => Standardizer::identity(target.obs_dim),
     };
-    let reward_scale = match config.iql.reward_scale {
+    let reward_scale = match config.backbone().map_or(RewardScale::None, |iql| iql.reward_scale) {
         RewardScale::None => 1.0,
         RewardScale::ReturnRange => {
             let tables: Vec<_> = data.trajectories.iter().map(Arc::as_ref).collect();

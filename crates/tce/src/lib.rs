@@ -14,6 +14,7 @@ mod generator;
 mod inputs;
 mod layers;
 mod learning;
+mod methods;
 mod metrics;
 mod mixture;
 mod output;

@@ -10,7 +10,7 @@
 //! Source and generated rows stand λ : (1 − λ) in the mixture. The paper generates (1 − λ)|D_src| rows; where fewer are
 //! generated, the mixture shrinks and its ratio stays.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::Serialize;
@@ -101,15 +101,18 @@ struct DistanceSpec {
 
 /// One number per source row, the smaller the closer to the target; computed once per pair of data sets.
 pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f32>> {
+    Ok(distances_stage(inputs, kind, root)?.0)
+}
+
+/// [`distances`], and the directory where they are.
+pub fn distances_stage(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<(Vec<f32>, PathBuf)> {
     let stage = Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(true), kind })?;
     let file = stage.file("distances.safetensors");
     if stage.summary::<usize>()?.is_some() {
         let mut loaded = NamedParameters::load(&file)?;
-        return loaded
-            .tensors
-            .remove("distances")
-            .map(|(_, values)| values)
-            .ok_or_else(|| Error::missing(&file, "no tensor `distances`; remove the directory to compute it again"));
+        let remedy = "no tensor `distances`; remove the directory to compute it again";
+        let (_, values) = loaded.tensors.remove("distances").ok_or_else(|| Error::missing(&file, remedy))?;
+        return Ok((values, stage.directory().to_owned()));
     }
     let (source, target) = (Rows::transitions(inputs.source_rows()?), Rows::transitions(&inputs.target.rows));
     let values = match kind {
@@ -121,7 +124,7 @@ pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f
     let attempt = stage.attempt()?;
     out.save(&attempt.file("distances.safetensors"))?;
     attempt.finish(&["distances.safetensors".into()], values.len())?;
-    Ok(values)
+    Ok((values, stage.directory().to_owned()))
 }
 
 #[cfg(test)]

@@ -6,15 +6,19 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use tce_base::{write_atomically, write_json};
+use tce_learn::Mode;
 use tce_nn::Device;
 
 use crate::actors::{Arena, Evaluation};
-use crate::config::{Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows};
+use crate::config::{
+    Algorithm, Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows,
+};
 use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
-use crate::learning::{Learned, MemberData, Place, learn};
-use crate::mixture::extra_rows;
+use crate::learning::{Learned, MemberData, learn};
+use crate::methods::{closeness, row_scores};
+use crate::mixture::{distances, extra_rows};
 use crate::stage::Stage;
 
 /// The outcome of a variant.
@@ -22,6 +26,9 @@ use crate::stage::Stage;
 pub struct Summary {
     /// The variant's name, or what the user called the run.
     pub name: String,
+    /// Whether the learner is the public code's or the paper's, where they differ.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mode: Option<Mode>,
     /// The seeds, one member each.
     pub seeds: Vec<u64>,
     /// Normalised score per seed; None if its policy could not be judged. Empty without a simulator.
@@ -64,6 +71,22 @@ impl Config {
     pub fn needs_source(&self) -> bool {
         self.mixture.source != SourceRows::None
             || (self.mixture.generated && (self.generator.source_states || self.generator.rows == 0))
+    }
+
+    /// Which distances of source rows decide, in the mixture or in the learner, if any.
+    pub fn distances(&self) -> Option<SourceRows> {
+        match self.mixture.source {
+            kind @ (SourceRows::Nearest | SourceRows::Transport) => Some(kind),
+            SourceRows::All if self.source_alone() && self.learner.algorithm == Algorithm::Otdf => {
+                Some(SourceRows::Transport)
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether the rows besides the target's are the source's, as they are.
+    fn source_alone(&self) -> bool {
+        self.mixture.source == SourceRows::All && !self.mixture.generated
     }
 }
 
@@ -121,11 +144,22 @@ pub fn run(
         // Generated rows among them are no trajectories.
         trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].clone() });
     }
+    let scores: Vec<_> = match &extra {
+        // Kept as a stage: every seed has the same rows.
+        Some(_) if config.source_alone() && config.distances().is_some() => {
+            vec![Some(closeness(distances(inputs, SourceRows::Transport, root)?)); seeds.len()]
+        }
+        Some(extra) => {
+            let of = |others: &Arc<_>| row_scores(config.learner.algorithm, &target, others);
+            extra.iter().map(of).collect::<Result<_>>()?
+        }
+        None => vec![None; seeds.len()],
+    };
     let data = |(m, &seed): (usize, &u64)| MemberData {
         seed,
         target: target.clone(),
         extra: extra.as_ref().map(|e| e[m].clone()),
-        row_scores: None,
+        row_scores: scores[m].clone(),
         trajectories: trajectories.clone(),
     };
     let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
@@ -135,7 +169,7 @@ pub fn run(
     };
     let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
     drop(extra);
-    let place = Place { directory: attempt.directory(), key: attempt.key() };
+    let place = (attempt.directory(), attempt.key());
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         for (policy, seed) in policies.iter().zip(seeds) {
             let file = format!("policy-seed{seed}.safetensors");
@@ -146,6 +180,7 @@ pub fn run(
     })?;
     let summary = Summary {
         name: name.to_owned(),
+        mode: config.learner.mode(),
         seeds: seeds.to_vec(),
         scores: learned.scores(),
         learned,

@@ -4,6 +4,11 @@ use std::fmt;
 
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
+use tce_data::Shift;
+use tce_learn::Mode;
+
+use crate::config::Config;
+use crate::layers::{Layered, Preset};
 
 /// A method of the comparison.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ValueEnum)]
@@ -27,6 +32,30 @@ pub enum Variant {
     TceNoFilter,
     /// TCE(OG) without the behaviour-policy term.
     TceNoReg,
+    /// DARA on target and source rows.
+    Dara,
+    /// DARA as its public code has it.
+    DaraPublished,
+    /// BOSA on target and source rows.
+    Bosa,
+    /// BOSA as its public code has it.
+    BosaPublished,
+    /// SRPO on target and source rows.
+    Srpo,
+    /// SRPO as its public code has it.
+    SrpoPublished,
+    /// IGDF on target and source rows.
+    Igdf,
+    /// IGDF as its public code has it.
+    IgdfPublished,
+    /// OTDF on target and source rows.
+    Otdf,
+    /// OTDF as its public code has it.
+    OtdfPublished,
+    /// TD3+BC on target and source rows.
+    Td3Bc,
+    /// ReBRAC on target and source rows.
+    Rebrac,
     /// Behaviour cloning of the target rows, observations as they are.
     BcRaw,
     /// Behaviour cloning of the target rows, observations standardised: the floor.
@@ -44,8 +73,8 @@ impl Variant {
         self.to_possible_value().expect("no variant is hidden").get_name().to_owned()
     }
 
-    /// The name in tables.
-    pub fn title(self) -> &'static str {
+    /// The name in tables, without the mode, which is the configuration's to tell.
+    fn title(self) -> &'static str {
         match self {
             Variant::TceOg => "TCE(OG)",
             Variant::TceNn => "TCE(NN)",
@@ -56,17 +85,49 @@ impl Variant {
             Variant::IqlSwt => "IQL*(SwT)",
             Variant::TceNoFilter => "TCE(OG) w/o filtering",
             Variant::TceNoReg => "TCE(OG) w/o policy reg.",
+            Variant::Dara | Variant::DaraPublished => "DARA",
+            Variant::Bosa | Variant::BosaPublished => "BOSA",
+            Variant::Srpo | Variant::SrpoPublished => "SRPO",
+            Variant::Igdf | Variant::IgdfPublished => "IGDF",
+            Variant::Otdf | Variant::OtdfPublished => "OTDF",
+            Variant::Td3Bc => "TD3+BC",
+            Variant::Rebrac => "ReBRAC",
             Variant::BcRaw => "BC, raw observations",
             Variant::Bc => "BC, standardised",
             Variant::BcTop => "BC, best half",
         }
     }
 
+    /// The name in tables of a row that `config` decides: its learner, if that is not the variant's own, and its mode.
+    pub fn row_title(self, config: &Config) -> String {
+        let own = Layered::new(Preset::Default, None, Some(self), None, &[]).and_then(|l| l.config());
+        let algorithm = config.learner.algorithm;
+        let mut title = self.title().to_owned();
+        if own.is_ok_and(|own| own.learner.algorithm != algorithm) {
+            title += &format!(", {}", algorithm.method().name);
+        }
+        if config.learner.mode() == Some(Mode::Published) {
+            title += " (published)";
+        }
+        title
+    }
+
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
-    pub(crate) fn layer(self, lambda: f64) -> String {
+    pub(crate) fn layer(self, lambda: f64, shift: Option<Shift>) -> String {
         let iql = |generated: bool, source: &str, lambda: f64| {
             format!("mixture = {{ generated = {generated}, source = {source:?}, lambda = {lambda:?} }}\n")
         };
+        let rival = |algorithm: &str, table: &str, rest: &str| {
+            let mixture = iql(false, "all", 1.0);
+            format!("{mixture}learner.algorithm = {algorithm:?}\nlearner.iql.regulariser = \"none\"\n")
+                + rest
+                + &match self.name().ends_with("-published") {
+                    true => format!("learner.{table}.mode = \"published\"\n"),
+                    false => String::new(),
+                }
+        };
+        // OTDF's own choice of its β_reg.
+        let beta_reg = if shift == Some(Shift::Kinematic) { "learner.otdf.beta_reg = 0.1\n" } else { "" };
         let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql(false, "none", 0.0));
         match self {
             Variant::TceOg => iql(true, "none", 0.0),
@@ -82,6 +143,13 @@ impl Variant {
             Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "relabelled", 1.0)),
             Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql(true, "none", 0.0)),
             Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql(true, "none", 0.0)),
+            Variant::Dara | Variant::DaraPublished => rival("dara", "dara", ""),
+            Variant::Bosa | Variant::BosaPublished => rival("bosa", "bosa", ""),
+            Variant::Srpo | Variant::SrpoPublished => rival("srpo", "srpo", ""),
+            Variant::Igdf | Variant::IgdfPublished => rival("igdf", "igdf", ""),
+            Variant::Otdf | Variant::OtdfPublished => rival("otdf", "otdf", beta_reg),
+            Variant::Td3Bc => rival("td3-bc", "td3_bc", ""),
+            Variant::Rebrac => rival("rebrac", "rebrac", ""),
             Variant::BcRaw => bc("learner.standardise = false\n"),
             Variant::Bc => bc("learner.standardise = true\n"),
             Variant::BcTop => bc("learner.standardise = true\nlearner.top = 0.5\n"),
@@ -98,13 +166,15 @@ impl fmt::Display for Variant {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layers::{Layered, Preset};
 
     #[test]
     fn every_variant_is_a_valid_layer_on_every_preset() {
         for preset in [Preset::Paper, Preset::Default, Preset::Quick] {
             for &variant in Variant::value_variants() {
                 let config = Layered::new(preset, None, Some(variant), None, &[]).unwrap().config().unwrap();
+                let published = variant.name().ends_with("-published");
+                assert_eq!(config.learner.mode() == Some(Mode::Published), published);
+                assert_eq!(variant.row_title(&config).ends_with(" (published)"), published);
                 assert!(
                     config.mixture.lambda > 0.0 || matches!(config.mixture.source, crate::config::SourceRows::None)
                 );

@@ -152,6 +152,21 @@ fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
     eprintln!("{ends} runs came to their end");
 }
 
+/// What BOSA and IGDF train before their first step is gone on with too.
+#[test]
+fn rivals_killed_anywhere_learn_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    let task = ["run", "hopper-morph:medium->expert", "--variant", "bosa,igdf,otdf", "--no-floors", "--out", "runs"];
+    let own = [
+        "--set=learner.bosa.cvae.steps=150",
+        "--set=learner.bosa.cvae.hidden=[16]",
+        "--set=learner.bosa.cvae.batch=32",
+        "--set=learner.igdf.steps=200",
+        "--set=learner.steps=100",
+    ];
+    kill_loop(dir.path(), &[&task[..], SMALL, &own].concat(), "runs", kills(8), 3);
+}
+
 #[test]
 fn an_agent_killed_anywhere_learns_the_same() {
     let dir = tempfile::tempdir().unwrap();

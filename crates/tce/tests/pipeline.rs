@@ -91,6 +91,62 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert!(rows_of("tce-no-reg") < 600, "the filter rejects something");
 }
 
+/// Every rival and both of its modes, beside TCE's own rows under another learner.
+#[test]
+fn every_rival_runs_and_says_its_mode() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Kinematic);
+    let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+    let run = |rest: &[&str]| {
+        let mut args = vec!["run", "hopper-kinematic:medium->medium", "--no-floors", "--out", "out"];
+        args.extend(data);
+        args.extend(rest);
+        args.extend(TINY);
+        args.extend([
+            "--set=learner.bosa.cvae.steps=5",
+            "--set=learner.bosa.cvae.hidden=[16]",
+            "--set=learner.igdf.steps=5",
+        ]);
+        tce_json(dir.path(), &args)
+    };
+    let rivals = ["dara", "bosa", "srpo", "igdf", "otdf"];
+    let both: Vec<String> = rivals.iter().flat_map(|r| [r.to_string(), format!("{r}-published")]).collect();
+    let report = run(&["--variant", &format!("{},td3-bc,rebrac", both.join(","))]);
+    let rows = report["rows"].as_array().unwrap();
+    assert_eq!(rows.len(), 12);
+    for row in rows {
+        assert!(row["scores"][0].is_number(), "{row}");
+        let published = row["variant"].as_str().unwrap().ends_with("-published");
+        let rival = rivals.iter().any(|r| row["variant"].as_str().unwrap().starts_with(r));
+        assert_eq!(row["title"].as_str().unwrap().ends_with(" (published)"), published);
+        assert_eq!(row["mode"] == "published", published);
+        assert_eq!(row["mode"] == "corrected", rival && !published);
+        let left = files(&dir.path().join(row["directory"].as_str().unwrap()));
+        assert!(left.iter().all(|p| p.extension().is_none_or(|e| e != "checkpoint")), "{left:?}");
+    }
+    let config =
+        fs::read_to_string(dir.path().join(rows[8]["directory"].as_str().unwrap()).join("config.toml")).unwrap();
+    assert!(config.contains("beta_reg = 0.1"), "OTDF's own choice for this shift");
+
+    let other = run(&["--variant", "tce-og", "--learner", "td3-bc"]);
+    assert_eq!(other["rows"][0]["title"], "TCE(OG), td3-bc");
+    let chosen = run(&["--variant", "tce-og", "--learner", "otdf"]);
+    assert!(chosen["rows"][0]["scores"][0].is_number(), "costs of generated rows are computed on the spot");
+}
+
+#[test]
+fn learners_are_listed() {
+    let dir = tempfile::tempdir().unwrap();
+    let list = tce_json(dir.path(), &["learn", "--list"]);
+    let names: Vec<_> = list.as_array().unwrap().iter().map(|m| m["name"].as_str().unwrap().to_owned()).collect();
+    assert!(names.len() >= 9 && ["bc", "iql", "otdf", "td3-bc"].iter().all(|n| names.contains(&n.to_string())));
+    let text = String::from_utf8(tce(dir.path(), &["learn", "--list"]).stdout).unwrap();
+    for method in list.as_array().unwrap() {
+        assert!(text.contains(method["name"].as_str().unwrap()));
+    }
+    assert_eq!(tce(dir.path(), &["learn"]).status.code(), Some(2), "without --list, files are needed");
+}
+
 /// The paper's process, sampler and learner, cut short; rows as many as the paper generates, (1 - λ) |D_src|.
 #[test]
 fn the_papers_preset_runs() {

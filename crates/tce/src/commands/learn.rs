@@ -13,7 +13,8 @@ use crate::actors::Arena;
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
 use crate::layers::ConfigArgs;
-use crate::learning::{Learned, MemberData, Place, learn};
+use crate::learning::{Learned, MemberData, learn};
+use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
 use crate::task::parse_environment;
@@ -21,15 +22,18 @@ use crate::task::parse_environment;
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
 pub struct Learn {
+    /// Print all learners: what they are, whose, and how their public code differs.
+    #[arg(long, exclusive = true)]
+    list: bool,
     /// The rows to learn from (HDF5). With --extra, half of every batch comes from here.
-    #[arg(long, value_name = "FILE")]
-    target: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "list")]
+    target: Option<PathBuf>,
     /// Further rows: the source's, generated ones, or a mixture of both.
     #[arg(long, value_name = "FILE")]
     extra: Option<PathBuf>,
     /// The learner (default: the configuration's).
-    #[arg(long, value_enum)]
-    algorithm: Option<Algorithm>,
+    #[arg(long, value_enum, alias = "algorithm")]
+    learner: Option<Algorithm>,
     /// bc: clone the best trajectories only, this share of them.
     #[arg(long, value_name = "SHARE")]
     top: Option<f64>,
@@ -43,8 +47,8 @@ pub struct Learn {
     #[arg(long, value_parser = parse_environment)]
     env: Option<(Agent, Shift)>,
     /// Directory for policies and metrics.
-    #[arg(long)]
-    out: PathBuf,
+    #[arg(long, required_unless_present = "list")]
+    out: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -60,18 +64,20 @@ struct Report {
 impl Learn {
     /// Runs the command.
     pub fn run(mut self, output: Output) -> Result<()> {
-        if let Some(algorithm) = self.algorithm {
-            let name = serde_json::to_value(algorithm).expect("plain");
-            self.config.sets.push(format!("learner.algorithm={name}"));
-        }
+        // clap asks for the files unless the list is wanted.
+        let (Some(target_file), Some(out)) = (self.target.take(), self.out.take()) else {
+            output.print(&Algorithm::ALL.map(Algorithm::method), list);
+            return Ok(());
+        };
+        self.config = self.config.with_learner(self.learner);
         self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
         // A training that was interrupted left metrics, but no result.
-        if self.out.join("summary.json").exists() {
+        if out.join("summary.json").exists() {
             return Err(Error::Usage(format!(
                 "{} holds the results of another learning; choose another --out",
-                self.out.display()
+                out.display()
             )));
         }
         let dims = self.env.map(|(agent, _)| agent.dims());
@@ -80,38 +86,42 @@ impl Learn {
             eprintln!("{}", loaded.report);
             Ok(Arc::new(loaded.transitions))
         };
-        let target = read(&self.target)?;
+        let target = read(&target_file)?;
         let extra = self.extra.as_ref().map(read).transpose()?;
         if let Some(extra) = &extra {
             ensure_same_agent(extra, &target)?;
         }
         let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
+        let row_scores = match &extra {
+            Some(extra) => row_scores(config.learner.algorithm, &target, extra)?,
+            None => None,
+        };
         let member = |&seed: &u64| MemberData {
             seed,
             target: target.clone(),
             extra: extra.clone(),
-            row_scores: None,
+            row_scores: row_scores.clone(),
             trajectories: vec![target.clone()],
         };
         let data = seeds.iter().map(member).collect();
         let spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
-            "target": sha256_file(&self.target)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
+            "target": sha256_file(&target_file)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
         });
         let key = sha256_hex(spec.to_string().as_bytes());
-        let place = Place { directory: &self.out, key: &key };
-        tce_base::write_atomically(&self.out.join("config.toml"), config.to_toml().as_bytes())?;
+        let place = (out.as_path(), key.as_str());
+        tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
         let learned = learn(data, &config.learner, &config.evaluation, arena, place, &cpu(), |policies| {
             for (policy, seed) in policies.iter().zip(&seeds) {
-                let file = self.out.join(format!("policy-seed{seed}.safetensors"));
+                let file = out.join(format!("policy-seed{seed}.safetensors"));
                 policy.save(&file)?;
                 files.push(file);
             }
             Ok(())
         })?;
         let report = Report { policies: files, seeds, learned };
-        tce_base::write_json(&self.out.join("summary.json"), &report)?;
+        tce_base::write_json(&out.join("summary.json"), &report)?;
         output.print(&report, |r| {
             let rows = r.policies.iter().enumerate().map(|(m, path)| {
                 let evaluation = r.learned.evaluations.get(m);
@@ -125,4 +135,15 @@ impl Learn {
         });
         Ok(())
     }
+}
+
+fn list(methods: &[Method; Algorithm::ALL.len()]) -> String {
+    let rows = methods.iter().map(|m| {
+        let modes = m.published.map_or_else(String::new, |what| format!("published: {what}"));
+        [m.name, m.description, m.reference, m.needs].map(str::to_owned).into_iter().chain([modes]).collect::<Vec<_>>()
+    });
+    let text = table(&["learner", "what it is", "reference", "besides target rows", "mode (default: corrected)"], rows);
+    format!(
+        "{text}\nSettings: learner.NAME, with _ for - (tce config show); a mode is chosen by --set learner.dara.mode=published"
+    )
 }

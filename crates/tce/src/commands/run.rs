@@ -4,6 +4,7 @@ use clap::Args;
 use serde::Serialize;
 use tce_nn::cpu;
 
+use crate::config::Algorithm;
 use crate::error::Result;
 use crate::inputs::{Behaviour, DataArgs, Inputs};
 use crate::layers::ConfigArgs;
@@ -32,6 +33,9 @@ pub struct Run {
     /// alone).
     #[arg(long)]
     no_floors: bool,
+    /// Another learner for the methods, not for the floors (`tce learn --list`).
+    #[arg(long, value_enum)]
+    learner: Option<Algorithm>,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -65,7 +69,10 @@ impl Run {
         // Every configuration is read before anything is computed.
         let configs = variants
             .iter()
-            .map(|(v, _)| self.config.layered(Some(self.task), Some(*v))?.config())
+            .map(|(v, floor)| {
+                let learner = self.learner.filter(|_| !floor);
+                self.config.clone().with_learner(learner).layered(Some(self.task), Some(*v))?.config()
+            })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
         let source_rows = configs.iter().find(|c| c.needs_source()).map(|c| c.source.rows);
@@ -74,7 +81,7 @@ impl Run {
         for ((variant, floor), config) in variants.into_iter().zip(&configs) {
             let place = self.task.directory();
             let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, &cpu())?;
-            rows.push(Row { title: variant.title().into(), variant, floor, summary });
+            rows.push(Row { title: variant.row_title(config), variant, floor, summary });
         }
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
         output.print(&Report { task: self.task, source, target, rows }, render);

@@ -133,6 +133,7 @@ struct Planned {
     directory: PathBuf,
     source: usize,
     target: usize,
+    distances: usize,
     expand: usize,
     run: usize,
 }
@@ -145,6 +146,7 @@ impl Plan {
         let planned = Planned {
             source: count(Kind::Source),
             target: count(Kind::Target),
+            distances: count(Kind::Distances),
             expand: count(Kind::Expand),
             run: count(Kind::Run),
             directory,
@@ -153,8 +155,13 @@ impl Plan {
             Sweep::create(&planned.directory, manifest)?;
         }
         output.print(&planned, |p| {
-            let rows =
-                [("source data", p.source), ("target data", p.target), ("generated rows", p.expand), ("runs", p.run)];
+            let rows = [
+                ("source data", p.source),
+                ("target data", p.target),
+                ("distances", p.distances),
+                ("generated rows", p.expand),
+                ("runs", p.run),
+            ];
             let text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
             format!("{text}\n{}", p.directory.display())
         });

@@ -110,6 +110,8 @@ pub enum Kind {
     Source,
     /// Target rows from the zoo.
     Target,
+    /// Distances of source rows to the target's, which several runs share.
+    Distances,
     /// Networks, label models and generated rows, which several runs share.
     Expand,
     /// A policy and its score.
@@ -157,6 +159,7 @@ impl fmt::Display for Entry {
         match kind {
             Kind::Source => write!(f, "{index}: source rows, {}-{}", task.agent, task.source),
             Kind::Target => write!(f, "{index}: target rows, {}-{}-{}", task.agent, task.shift, task.target),
+            Kind::Distances => write!(f, "{index}: distances of source rows, {task}"),
             Kind::Expand => write!(f, "{index}: generated rows, {task}, seed {seed}"),
             Kind::Run => write!(f, "{index}: {}, {task}, seed {seed}", self.column()),
         }
@@ -302,6 +305,11 @@ impl Manifest {
             let spec = serde_json::json!([task.agent, task.source, config.source.rows, from_zoo]);
             needs.push(self.add(known, entry(Kind::Source, spec, 0, Vec::new())));
         }
+        if let Some(kind) = config.distances() {
+            let spec = serde_json::json!([task, data, from_zoo, config.source, kind]);
+            let distances = self.add(known, entry(Kind::Distances, spec, 0, needs.clone()));
+            needs.push(distances);
+        }
         if config.mixture.generated || config.mixture.source == SourceRows::Relabelled {
             let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
             let generated = config.mixture.generated;
@@ -317,7 +325,8 @@ impl Manifest {
                 generated,
                 seed
             ]);
-            needs.push(self.add(known, entry(Kind::Expand, spec, seed, needs.clone())));
+            let before = needs.clone();
+            needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
         }
         let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
         let run = entry(Kind::Run, spec, seed, needs);

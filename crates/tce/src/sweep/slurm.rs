@@ -136,7 +136,7 @@ impl Sweep {
         let missing = self.missing()?;
         let mut arrays: Vec<Array> = Vec::new();
         let mut before: Vec<String> = Vec::new();
-        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Expand], &[Kind::Run]] {
+        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Distances, Kind::Expand], &[Kind::Run]] {
             let due = missing.iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index));
             let due: Vec<usize> = due.map(|e| e.index).collect();
             let elements: Vec<Vec<usize>> = due.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();

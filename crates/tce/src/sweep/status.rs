@@ -134,6 +134,7 @@ impl Status {
         let word = |kind: &Kind| match kind {
             Kind::Source => "source data",
             Kind::Target => "target data",
+            Kind::Distances => "distances",
             Kind::Expand => "generated rows",
             Kind::Run => "runs",
         };

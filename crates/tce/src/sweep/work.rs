@@ -16,6 +16,7 @@ use crate::PROGRAM;
 use crate::error::{Error, Result};
 use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
+use crate::mixture::distances_stage;
 use crate::pipeline::run;
 use crate::stage::{Owner, files_of};
 
@@ -183,6 +184,12 @@ impl Sweep {
                     false => label_models(&inputs, &config.labels, seeds, root, &cpu())?.1,
                 };
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
+            }
+            Kind::Distances => {
+                let inputs = Inputs::of_task(entry.task, &args, rows)?;
+                let kind = config.distances().expect("planned for a configuration that has some");
+                let place = distances_stage(&inputs, kind, root)?.1;
+                (None, place.clone(), files_of(&place)?)
             }
             Kind::Run => {
                 let inputs = Inputs::of_task(entry.task, &args, rows)?;

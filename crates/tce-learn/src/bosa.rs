@@ -1,0 +1,289 @@
+//! BOSA (Liu et al. 2024): critics learn from rows that the dynamics of both domains support, the policy stays where behaviour does.
+//!
+//! ```text
+//! β̂(a|s), p̂_1..n(s'|s, a): variational autoencoders on rows of both domains ([`crate::cvae`]), before the first step
+//! m   = 1[min over i of ln p̂_i(s'|s, a) > ln ε]
+//! a'  = clip(π'(s') + clip(σ n, ±c), ±1);  y = r + γ (1 - terminal) min(Q1', Q2')(s', a')
+//! L_Q = Σ_k [½ mean m (Qk(s, a) - y)² + λ_Q mean over source rows of Qk(s, a)]                     → Q1, Q2
+//! every d-th step:  L_π = -mean Q1(s, π(s)) / mean |Q1(s, π(s))| - λ_π mean ln β̂(π(s)|s)           → π;  Q', π' follow
+//! ```
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | ε | `threshold` | .01 | ODRL |
+//! | λ_Q, λ_π | `value_weight`, `support_weight` | .1, .1 | ODRL |
+//! | n | `ensemble` | 5 | ODRL |
+//! | K, β² | `samples`, `std`² | 1, .125 | ODRL: one sample, √(β/4) with β = .5 |
+//! | - | `cvae` | 256-256, 5 000 steps of 128 + 128 rows | ODRL: 750-750, 100 000 steps; ours fits two cores |
+//! | γ | `discount` | .99 | ODRL |
+//! | σ, c, d, ρ | `delay` | .2, .5, 2, .005 | ODRL |
+//! | - | `critic_lr`, `hidden`, `actor` | 3e-4, 256-256 | ODRL |
+//! | - | `mode` | corrected | published: y = r + γ terminal min(Q1', Q2')(s', a') |
+//!
+//! **Published**: ODRL's buffer returns 1 - terminal, which its BOSA takes for terminal: it bootstraps at terminal rows and nowhere
+//! else, and the critics learn the immediate reward.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
+
+use crate::actor::ActorConfig;
+use crate::buffer::{Buffer, Minibatch};
+use crate::critic::Twins;
+use crate::cvae::{Cvae, CvaeConfig, CvaeLearner, Density, Modelled};
+use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::error::{LearnError, within};
+use crate::losses::{member_mean, squared_td_error};
+use crate::mode::Mode;
+use crate::policy::Policy;
+use crate::selection::need_others;
+use crate::td3_bc::normalised_value;
+use crate::training::{Learner, Meter, Place, PolicyLearner, prepare};
+
+/// The configuration of [`Bosa`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BosaConfig {
+    /// Where critics bootstrap.
+    pub mode: Mode,
+    /// ε
+    pub threshold: f64,
+    /// λ_Q
+    pub value_weight: f64,
+    /// λ_π
+    pub support_weight: f64,
+    /// n
+    pub ensemble: usize,
+    /// K
+    pub samples: usize,
+    /// Standard deviation of the decoders' densities.
+    pub std: f64,
+    /// The autoencoders; `batch` counts rows of both domains.
+    pub cvae: CvaeConfig,
+    /// γ
+    pub discount: f64,
+    /// σ, c, d, ρ
+    pub delay: DelayConfig,
+    /// Learning rate of the critics, constant.
+    pub critic_lr: f64,
+    /// Hidden layers of the critics.
+    pub hidden: Vec<usize>,
+    /// The policy; its `form` is tanh mean.
+    pub actor: ActorConfig,
+}
+
+impl Default for BosaConfig {
+    fn default() -> Self {
+        Self {
+            mode: Mode::default(),
+            threshold: 0.01,
+            value_weight: 0.1,
+            support_weight: 0.1,
+            ensemble: 5,
+            samples: 1,
+            std: 0.125f64.sqrt(),
+            cvae: CvaeConfig { hidden: vec![256, 256], steps: 5000, batch: 256, ..CvaeConfig::default() },
+            discount: 0.99,
+            delay: DelayConfig::default(),
+            critic_lr: 3e-4,
+            hidden: vec![256, 256],
+            actor: ActorConfig { cosine: false, ..ActorConfig::default() },
+        }
+    }
+}
+
+impl BosaConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("threshold", self.threshold, f64::MIN_POSITIVE..=1e30)?;
+        within("value_weight", self.value_weight, 0.0..=1e6)?;
+        within("support_weight", self.support_weight, 0.0..=1e6)?;
+        within("ensemble", self.ensemble as f64, 1.0..=1e3)?;
+        within("samples", self.samples as f64, 1.0..=1e4)?;
+        within("std", self.std, f64::MIN_POSITIVE..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
+    }
+
+    fn density(&self) -> Density {
+        Density { samples: self.samples, std: self.std, importance: true }
+    }
+}
+
+/// β̂ and p̂_1..n while they are trained, side by side on the same batches.
+struct Autoencoders {
+    all: Vec<CvaeLearner>,
+}
+
+impl Learner for Autoencoders {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let fork = || meter.fork();
+        let meters: Vec<Meter> = (self.all.par_iter_mut())
+            .map(|learner| {
+                let mut meter = fork();
+                learner.update(batch, step, &mut meter);
+                meter
+            })
+            .collect();
+        meters.into_iter().for_each(|m| meter.join(m));
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        for own in self.all.iter().map(Learner::state) {
+            state.tensors.extend(own.tensors);
+            state.metadata.extend(own.metadata);
+        }
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.all.iter_mut().try_for_each(|learner| learner.restore(state, path))
+    }
+}
+
+/// BOSA of a population.
+pub struct Bosa {
+    config: BosaConfig,
+    actor: DelayedActor,
+    critics: Twins,
+    behaviour: Cvae,
+    dynamics: Vec<Cvae>,
+    members: Vec<Streams>,
+}
+
+impl Bosa {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps; the autoencoders are trained here. None if the
+    /// user interrupted that.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used, or there are no source rows.
+    pub fn new(
+        buffer: &Buffer,
+        config: &BosaConfig,
+        steps: u64,
+        place: Place<'_>,
+        device: &Device,
+    ) -> Result<Option<Self>, LearnError> {
+        config.check()?;
+        need_others("BOSA", buffer.members())?;
+        let rows = Buffer::new(buffer.members().to_vec(), config.cvae.batch)?.with_stream("bosa batch");
+        let model = |modelled, name: &str| CvaeLearner::new(&rows, &config.cvae, modelled, name, device);
+        let mut all = vec![model(Modelled::Behaviour, "bosa behaviour")?];
+        for i in 0..config.ensemble {
+            all.push(model(Modelled::Dynamics, &format!("bosa dynamics {i}"))?);
+        }
+        let mut autoencoders = Autoencoders { all };
+        if !prepare(&mut autoencoders, &rows, config.cvae.steps, "BOSA autoencoders", place, device)? {
+            return Ok(None);
+        }
+        let mut models = autoencoders.all.iter().map(CvaeLearner::model);
+        let (inputs, train) = (buffer.inputs().len(), device.clone().autodiff());
+        Ok(Some(Self {
+            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
+            critics: Twins::new(inputs, buffer.act_dim(), &config.hidden, &buffer.streams(), &train),
+            behaviour: models.next().expect("the first of them"),
+            dynamics: models.collect(),
+            members: buffer.streams(),
+            config: config.clone(),
+        }))
+    }
+
+    /// m `[P, B, 1]`.
+    fn supported(&self, batch: &Minibatch, step: u64) -> Tensor<3> {
+        let (c, x) = Modelled::Dynamics.split(batch);
+        let density = |(i, model): (usize, &Cvae)| {
+            let name = format!("bosa density {i}");
+            model.log_density(c.clone(), x.clone(), self.config.density(), &self.members, &name, step)
+        };
+        let densities: Vec<_> = self.dynamics.par_iter().enumerate().map(density).collect();
+        let least = densities.into_iter().reduce(Tensor::min_pair).expect("at least one model");
+        least.greater_elem(self.config.threshold.ln()).float()
+    }
+}
+
+/// y, from q = min(Q1', Q2')(s', a').
+pub fn critic_target(batch: &Minibatch, q: Tensor<3>, discount: f64, mode: Mode) -> Tensor<3> {
+    let bootstrap = match mode {
+        Mode::Corrected => batch.not_done.clone(),
+        Mode::Published => -batch.not_done.clone() + 1.0,
+    };
+    batch.r.clone() + bootstrap * q * discount
+}
+
+impl Learner for Bosa {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
+        let (mask, y) = rayon::join(
+            || self.supported(batch, step),
+            || {
+                let a2 = self.actor.next_action(batch.s2.clone(), step);
+                let q = self.critics.lesser_target(join(&batch.s2, a2));
+                critic_target(batch, q, self.config.discount, self.config.mode)
+            },
+        );
+        meter.record("supported", &mask);
+        let Self { config: c, actor, critics, behaviour, members, .. } = self;
+        let (first, others) = (batch.target_rows, batch.s.dims()[1] - batch.target_rows);
+        let loss = |q: Tensor<3>| {
+            let source = member_mean(q.clone().narrow(1, first, others));
+            squared_td_error(q, y.clone(), Some(mask.clone())) * 0.5 + source * c.value_weight
+        };
+        let loss = critics.step_down(join(&batch.s, batch.a.clone()), loss, c.critic_lr, actor.polyak(step));
+        meter.record("critic_loss", &loss);
+        if actor.due(step) {
+            let a = actor.forward(batch.s.clone()).mean;
+            let (q, density) = rayon::join(
+                || critics.pair[0].frozen(join(&batch.s, a.clone())),
+                || behaviour.log_density(batch.s.clone(), a.clone(), c.density(), members, "bosa support", step),
+            );
+            drop(a);
+            meter.record("policy_value", &q);
+            meter.record("policy_support", &density);
+            let loss = -normalised_value(q) - member_mean(density) * c.support_weight;
+            actor.step(loss, step);
+        }
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.actor.save(&mut state);
+        self.critics.save(&mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.actor.load(state, path)?;
+        self.critics.load(state, path)
+    }
+}
+
+impl PolicyLearner for Bosa {
+    fn policies(&self) -> Vec<Policy> {
+        self.actor.policies()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::{cpu, host, tensor};
+
+    #[test]
+    fn the_modes_bootstrap_at_opposite_rows() {
+        let column = |v: [f32; 2]| tensor(v.to_vec(), [1, 2, 1], &cpu());
+        let zero = || column([0.0, 0.0]);
+        let (r, not_done) = (column([1.0, 2.0]), column([1.0, 0.0]));
+        let batch = Minibatch { s: zero(), a: zero(), s2: zero(), r, not_done, target_rows: 1, picks: vec![] };
+        let y = |mode| host(critic_target(&batch, column([10.0, 20.0]), 0.5, mode));
+        assert_eq!(y(Mode::Corrected), [6.0, 2.0]);
+        assert_eq!(y(Mode::Published), [1.0, 12.0]);
+    }
+}

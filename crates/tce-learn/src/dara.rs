@@ -1,0 +1,235 @@
+//! DARA (Liu et al. 2022): source rewards are lowered where the source moves in a way that the target does not.
+//!
+//! ```text
+//! C_sas, C_sa: classifiers of (s, a, s') and (s, a) into source and target, on inputs x + σ n, n ~ N(0, I)
+//! L_C = CE(C_sas) + CE(C_sa)                                                      → both classifiers
+//! Δ   = ln p(tar|s,a,s') - ln p(tar|s,a) - ln p(src|s,a,s') + ln p(src|s,a),  each p + 1e-10;  Δ ← clip(Δ, ±c)
+//! r   ← r + η Δ  for source rows                                  then a step of IQL ([`crate::iql`])
+//! ```
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | η | `eta` | .1 | ODRL |
+//! | c | `clip` | 10 | ODRL |
+//! | σ | `noise` | 1 | ODRL, on raw inputs; here on inputs as the networks see them |
+//! | - | `hidden` | 256, 256 ReLU | ODRL |
+//! | - | `lr` | 3e-4 | ODRL |
+//! | - | `mode` | corrected | published: CE takes p for logits (below) |
+//!
+//! **Published**: ODRL's forward pass ends in a softmax, and cross-entropy, which has one of its own, is given its result: L_C
+//! is then between .31 and 1.31 for every row, and its gradient vanishes where the classifier is sure. Δ is computed from the
+//! first softmax in both modes.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::burn::tensor::activation::{log_softmax, softmax};
+use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
+
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::{LearnError, within};
+use crate::iql::{Iql, IqlConfig};
+use crate::losses::member_mean;
+use crate::mode::Mode;
+use crate::policy::Policy;
+use crate::regulariser::Regulariser;
+use crate::selection::need_others;
+use crate::training::{Learner, Meter, PolicyLearner, member_noise};
+
+/// Added to a probability before its logarithm (ODRL).
+const TINY: f64 = 1e-10;
+
+/// The configuration of [`Dara`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DaraConfig {
+    /// Which loss the classifiers get.
+    pub mode: Mode,
+    /// η
+    pub eta: f64,
+    /// c
+    pub clip: f64,
+    /// σ
+    pub noise: f64,
+    /// Hidden layers of the classifiers.
+    pub hidden: Vec<usize>,
+    /// Learning rate of the classifiers, constant.
+    pub lr: f64,
+}
+
+impl Default for DaraConfig {
+    fn default() -> Self {
+        Self { mode: Mode::default(), eta: 0.1, clip: 10.0, noise: 1.0, hidden: vec![256, 256], lr: 3e-4 }
+    }
+}
+
+impl DaraConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("eta", self.eta, 0.0..=1e6)?;
+        within("clip", self.clip, 0.0..=1e6)?;
+        within("noise", self.noise, 0.0..=1e6)?;
+        within("lr", self.lr, 0.0..=1.0)
+    }
+}
+
+/// DARA of a population.
+pub struct Dara {
+    config: DaraConfig,
+    iql: Iql,
+    sas: Trained<Mlp>,
+    sa: Trained<Mlp>,
+    /// The classifiers draw batches of their own.
+    buffer: Buffer,
+    members: Vec<Streams>,
+    device: Device,
+}
+
+impl Dara {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If a configuration cannot be used, or there are no source rows.
+    pub fn new(
+        buffer: &Buffer,
+        config: &DaraConfig,
+        iql: &IqlConfig,
+        regulariser: Regulariser,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
+        config.check()?;
+        need_others("DARA", buffer.members())?;
+        let (members, train) = (buffer.streams(), device.clone().autodiff());
+        let (s, a) = (buffer.inputs().len(), buffer.act_dim());
+        let classifier = |name: &str, inputs: usize| {
+            Trained::new(MlpConfig::relu(inputs, &config.hidden, 2).init(&members, name, &train))
+        };
+        Ok(Self {
+            iql: Iql::new(buffer, iql, regulariser, steps, device)?,
+            sas: classifier("dara sas", 2 * s + a),
+            sa: classifier("dara sa", s + a),
+            buffer: buffer.clone().with_stream("dara batch"),
+            config: config.clone(),
+            members,
+            device: device.clone(),
+        })
+    }
+}
+
+/// Cross-entropy of `outputs` `[P, B, 2]` against the labels target (1) for the first `target_rows` rows and source (0) for the
+/// others, mean over rows. Published: of softmax(`outputs`), as if they were logits.
+pub fn domain_cross_entropy(outputs: Tensor<3>, target_rows: usize, mode: Mode) -> Tensor<3> {
+    let [_, b, _] = outputs.dims();
+    let logits = match mode {
+        Mode::Published => softmax(outputs, 2),
+        Mode::Corrected => outputs,
+    };
+    let log_p = log_softmax(logits, 2);
+    let target = log_p.clone().narrow(1, 0, target_rows).narrow(2, 1, 1);
+    let source = log_p.narrow(1, target_rows, b - target_rows).narrow(2, 0, 1);
+    -member_mean(Tensor::cat(vec![target, source], 1))
+}
+
+/// Δ `[P, B, 1]` before clipping, from the outputs `[P, B, 2]` of the two classifiers.
+pub fn dynamics_gap(sas: Tensor<3>, sa: Tensor<3>) -> Tensor<3> {
+    let log_p = |outputs: Tensor<3>, k: usize| (softmax(outputs, 2).narrow(2, k, 1) + TINY).log();
+    log_p(sas.clone(), 1) - log_p(sa.clone(), 1) - log_p(sas, 0) + log_p(sa, 0)
+}
+
+fn join(batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
+    let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
+    (Tensor::cat(vec![sa.clone(), batch.s2.clone()], 2), sa)
+}
+
+impl Learner for Dara {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, sas, sa, members, device, .. } = self;
+        let rows = self.buffer.sample(step, device);
+        let (x, y) = join(&rows);
+        let train = |net: &mut Trained<Mlp>, x: Tensor<3>, name: &str| {
+            let noise = member_noise(members, name, step, x.dims(), device);
+            let loss = domain_cross_entropy(net.net().forward(x + noise * c.noise), rows.target_rows, c.mode);
+            let value = loss.clone().inner();
+            net.step(loss.sum(), c.lr);
+            value
+        };
+        let (a, b) = rayon::join(|| train(sas, x, "dara noise sas"), || train(sa, y, "dara noise sa"));
+        meter.record("classifier_loss", &(a + b));
+
+        let (first, others) = (batch.target_rows, batch.s.dims()[1] - batch.target_rows);
+        let (x, y) = join(batch);
+        let source = |x: Tensor<3>| x.narrow(1, first, others);
+        let gap = dynamics_gap(sas.net().valid().forward(source(x)), sa.net().valid().forward(source(y)));
+        let gap = gap.clamp(-c.clip, c.clip);
+        meter.record("dynamics_gap", &gap);
+        let r = Tensor::cat(vec![batch.r.clone().narrow(1, 0, first), source(batch.r.clone()) + gap * c.eta], 1);
+        self.iql.step(&Minibatch { r, ..batch.clone() }, None, step, meter);
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = self.iql.state();
+        self.sas.save("dara sas", &mut state);
+        self.sa.save("dara sa", &mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.iql.restore(state, path)?;
+        self.sas.load("dara sas", state, path)?;
+        self.sa.load("dara sa", state, path)
+    }
+}
+
+impl PolicyLearner for Dara {
+    fn policies(&self) -> Vec<Policy> {
+        self.iql.policies()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::{cpu, host, tensor};
+
+    fn outputs() -> Tensor<3> {
+        // Rows: one target row, two source rows; columns: source, target.
+        tensor(vec![-1.0, 2.0, 0.5, -0.5, 3.0, 4.0], [1, 3, 2], &cpu())
+    }
+
+    fn softmax2(a: f64, b: f64) -> (f64, f64) {
+        let z = a.exp() + b.exp();
+        (a.exp() / z, b.exp() / z)
+    }
+
+    #[test]
+    fn the_modes_differ_by_one_softmax() {
+        let rows = [(-1.0, 2.0, true), (0.5, -0.5, false), (3.0, 4.0, false)];
+        let entropy = |twice: bool| {
+            let of = |&(a, b, target): &(f64, f64, bool)| {
+                let (a, b) = if twice { softmax2(a, b) } else { (a, b) };
+                let (source, tar) = softmax2(a, b);
+                -(if target { tar } else { source }).ln()
+            };
+            rows.iter().map(of).sum::<f64>() / 3.0
+        };
+        for (mode, twice) in [(Mode::Corrected, false), (Mode::Published, true)] {
+            let loss = host(domain_cross_entropy(outputs(), 1, mode))[0] as f64;
+            assert!((loss - entropy(twice)).abs() < 1e-6, "{mode:?}: {loss} is not {}", entropy(twice));
+        }
+    }
+
+    #[test]
+    fn the_gap_is_the_difference_of_log_odds() {
+        // With probabilities far from 0 the odds are the differences of the outputs.
+        let sa = tensor(vec![0.2, 0.1, 0.0, 0.0, -1.0, 1.0], [1, 3, 2], &cpu());
+        let gap = host(dynamics_gap(outputs(), sa));
+        for (gap, expected) in gap.iter().zip([3.0 + 0.1, -1.0, 1.0 - 2.0]) {
+            assert!((gap - expected).abs() < 1e-5, "{gap} is not {expected}");
+        }
+    }
+}

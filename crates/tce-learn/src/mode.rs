@@ -1,0 +1,15 @@
+//! As coded, or as meant.
+
+use serde::{Deserialize, Serialize};
+
+/// Which of two forms of a method is trained, where its public code and its paper differ. What exactly differs is told by the
+/// method's own file; nothing else does.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Mode {
+    /// With the defect of the public code, so that published figures can be explained.
+    Published,
+    /// Without it.
+    #[default]
+    Corrected,
+}

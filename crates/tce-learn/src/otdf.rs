@@ -1,0 +1,169 @@
+//! OTDF (Lyu et al. 2025): source rows are kept by their cost in the optimal transport to the target rows.
+//!
+//! ```text
+//! d_i = -Σ_j P_ij C_ij for every source row, from tce_data::transport_costs on [s, a, s']
+//! d̂   = (d - max d) / (max d - min d) over the source rows of a batch; the best share of them is kept
+//! w   = exp(d̂) for source rows, 1 for target rows: weights of L_Q                then a step of IQL ([`crate::iql`]) with
+//! L_π = mean of min(exp(β u), cap) Σ_d (tanh μ_d(s) - a_d)² - β_reg mean ln β(π(s)|s)    β: the target's behaviour CVAE
+//! ```
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | share | `keep` | .8 | OTDF's command line (its yaml says .25) |
+//! | w | `weighted` | true | OTDF |
+//! | β_reg | `beta_reg` | .5 | OTDF for morph and gravity; .1 for kinematic |
+//! | - | `mode` | corrected | published: every row is cloned with the mean weight of its batch |
+//! | β and its CVAE | `learner.behaviour` | - | [`crate::regulariser`], kind `otdf` |
+//! | d | `row_scores` of a [`crate::Member`] | - | a number per source row |
+//! | everything else | `learner.iql` | - | OTDF's IQL is ours |
+//!
+//! **Published**: a column of weights times a row of losses, in other words filtered cloning with a regulariser: the advantages have
+//! no effect on which action is cloned ([`PolicyExtraction::MeanWeight`]).
+//! OTDF's loader also takes the next row for s', across the ends of episodes; this is not repeated here.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, NamedParameters, NetworkError};
+
+use crate::actor::ActionReduction;
+use crate::buffer::{Buffer, Member, Minibatch};
+use crate::error::{LearnError, within};
+use crate::iql::{Iql, IqlConfig, PolicyExtraction};
+use crate::losses::member_mean;
+use crate::mode::Mode;
+use crate::policy::Policy;
+use crate::regulariser::{Regulariser, RegulariserKind};
+use crate::selection::{Selected, need_scores, scores_of_others};
+use crate::training::{Learner, Meter, PolicyLearner};
+
+/// The configuration of [`Otdf`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OtdfConfig {
+    /// How advantages reach the policy.
+    pub mode: Mode,
+    /// Share of a batch's source rows that is kept.
+    pub keep: f64,
+    /// Whether kept source rows weigh exp(d̂) in L_Q.
+    pub weighted: bool,
+    /// β_reg
+    pub beta_reg: f64,
+}
+
+impl Default for OtdfConfig {
+    fn default() -> Self {
+        Self { mode: Mode::default(), keep: 0.8, weighted: true, beta_reg: 0.5 }
+    }
+}
+
+impl OtdfConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("keep", self.keep, 0.0..=1.0)?;
+        within("beta_reg", self.beta_reg, 0.0..=1e6)
+    }
+
+    /// The IQL that this configuration makes of `iql`.
+    pub fn backbone(&self, iql: &IqlConfig) -> IqlConfig {
+        otdf_policy(iql, self.mode, self.beta_reg)
+    }
+}
+
+/// IQL with the policy of OTDF, which DmC takes over: tanh-Gaussian, squared errors summed over the action's components, and the
+/// behaviour CVAE as its regulariser.
+pub(crate) fn otdf_policy(iql: &IqlConfig, mode: Mode, beta_reg: f64) -> IqlConfig {
+    let policy_extraction = match mode {
+        Mode::Published => PolicyExtraction::MeanWeight,
+        Mode::Corrected => PolicyExtraction::AwrMse,
+    };
+    let mut iql = IqlConfig { policy_extraction, regulariser: RegulariserKind::Otdf, beta_reg, ..iql.clone() };
+    iql.actor.action_reduction = ActionReduction::Sum;
+    iql
+}
+
+/// OTDF of a population.
+pub struct Otdf {
+    config: OtdfConfig,
+    iql: Iql,
+    members: Vec<Member>,
+}
+
+impl Otdf {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps. `regulariser` is of the kind `otdf`.
+    ///
+    /// # Errors
+    /// If a configuration cannot be used, or there are no source rows or no costs of them.
+    pub fn new(
+        buffer: &Buffer,
+        config: &OtdfConfig,
+        iql: &IqlConfig,
+        regulariser: Regulariser,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
+        config.check()?;
+        need_scores("OTDF", buffer.members())?;
+        let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
+        Ok(Self { config: config.clone(), iql, members: buffer.members().to_vec() })
+    }
+}
+
+/// d̂ for the `others` source rows of every member, in place; 0 for all where they are equal.
+pub fn normalise(d: &mut [f32], others: usize) {
+    for d in d.chunks_mut(others.max(1)) {
+        let (low, high) = d.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+        let range = high - low;
+        d.iter_mut().for_each(|v| *v = if range > 0.0 { (*v - high) / range } else { 0.0 });
+    }
+}
+
+impl Learner for Otdf {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, iql, members } = self;
+        let mut d = scores_of_others(members, batch);
+        normalise(&mut d, batch.s.dims()[1] - batch.target_rows);
+        let kept = Selected::new(batch, &d, c.keep, |d| if c.weighted { d.exp() } else { 1.0 });
+        meter.record("critic_weight", &member_mean(kept.weights.clone()));
+        iql.step(&kept.batch, Some(kept.weights), step, meter);
+    }
+
+    fn state(&self) -> NamedParameters {
+        self.iql.state()
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.iql.restore(state, path)
+    }
+}
+
+impl PolicyLearner for Otdf {
+    fn policies(&self) -> Vec<Policy> {
+        self.iql.policies()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn costs_are_normalised_within_a_member() {
+        let mut d = [-3.0, -1.0, -2.0, 5.0, 5.0, 5.0];
+        normalise(&mut d, 3);
+        assert_eq!(d, [-1.0, 0.0, -0.5, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn the_modes_differ_in_policy_extraction_alone() {
+        let iql = IqlConfig::default();
+        let of = |mode| OtdfConfig { mode, ..OtdfConfig::default() }.backbone(&iql);
+        let (published, corrected) = (of(Mode::Published), of(Mode::Corrected));
+        assert_eq!(published.policy_extraction, PolicyExtraction::MeanWeight);
+        assert_eq!(corrected.policy_extraction, PolicyExtraction::AwrMse);
+        assert_eq!(IqlConfig { policy_extraction: PolicyExtraction::AwrMse, ..published }, corrected);
+    }
+}

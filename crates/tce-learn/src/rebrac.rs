@@ -1,0 +1,157 @@
+//! ReBRAC (Tarasov et al. 2023): TD3+BC with a penalty in the critics' target too, and critics with layer normalisation.
+//!
+//! ```text
+//! a'  = clip(π'(s') + clip(σ n, ±c), ±1)
+//! y   = r + γ (1 - terminal) (min(Q1', Q2')(s', a') - β_Q |a' - a'_data|²)
+//! L_Q = mean (Q1(s, a) - y)² + mean (Q2(s, a) - y)²                                      → Q1, Q2
+//! every d-th step:  L_π = β_π mean |π(s) - a|² - mean min(Q1, Q2)(s, π(s)) / mean |min(Q1, Q2)|   → π;  Q', π' follow
+//! ```
+//!
+//! a'_data is the action of the next row. Where the data do not tell it (the end of an episode, a generated row, a row whose
+//! neighbour was left out) the penalty is left out.
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | β_π | `actor_penalty` | .1 | Tarasov et al. choose from .001 .. 1 for each task; own |
+//! | β_Q | `critic_penalty` | .01 | the same, from 0 .. 1; own |
+//! | γ | `discount` | .99 | their MuJoCo tasks |
+//! | σ, c, d, ρ | `delay` | .2, .5, 2, .005 | [`crate::deterministic`] |
+//! | - | `critic_lr`, `actor.lr` | 3e-4 | theirs: 1e-3 at batches of 1024; ours are those of the other methods |
+//! | - | `hidden` | 256, 256, 256 ReLU, critics with layer normalisation | theirs |
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
+
+use crate::actor::{Actor, ActorConfig};
+use crate::buffer::{Buffer, Minibatch};
+use crate::critic::Twins;
+use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::error::{LearnError, within};
+use crate::policy::Policy;
+use crate::td3_bc::normalised_value;
+use crate::training::{Learner, Meter, PolicyLearner};
+
+/// The configuration of [`Rebrac`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RebracConfig {
+    /// β_π
+    pub actor_penalty: f64,
+    /// β_Q
+    pub critic_penalty: f64,
+    /// γ
+    pub discount: f64,
+    /// σ, c, d, ρ
+    pub delay: DelayConfig,
+    /// Learning rate of the critics, constant.
+    pub critic_lr: f64,
+    /// Hidden layers of the critics.
+    pub hidden: Vec<usize>,
+    /// The policy; its `form` is tanh mean.
+    pub actor: ActorConfig,
+}
+
+impl Default for RebracConfig {
+    fn default() -> Self {
+        let hidden = vec![256, 256, 256];
+        Self {
+            actor_penalty: 0.1,
+            critic_penalty: 0.01,
+            discount: 0.99,
+            delay: DelayConfig::default(),
+            critic_lr: 3e-4,
+            actor: ActorConfig { cosine: false, hidden: hidden.clone(), ..ActorConfig::default() },
+            hidden,
+        }
+    }
+}
+
+impl RebracConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("actor_penalty", self.actor_penalty, 0.0..=1e6)?;
+        within("critic_penalty", self.critic_penalty, 0.0..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
+    }
+}
+
+/// ReBRAC of a population.
+pub struct Rebrac {
+    config: RebracConfig,
+    actor: DelayedActor,
+    critics: Twins,
+    /// Where the next actions are looked up.
+    buffer: Buffer,
+}
+
+impl Rebrac {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used.
+    pub fn new(buffer: &Buffer, config: &RebracConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
+        config.check()?;
+        let critic = MlpConfig::relu(buffer.inputs().len() + buffer.act_dim(), &config.hidden, 1).with_layer_norm();
+        Ok(Self {
+            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
+            critics: Twins::with(&critic, &buffer.streams(), &device.clone().autodiff()),
+            buffer: buffer.clone(),
+            config: config.clone(),
+        })
+    }
+}
+
+impl Learner for Rebrac {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, actor, critics, buffer } = self;
+        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
+        let a2 = actor.next_action(batch.s2.clone(), step);
+        let (data, known) = buffer.next_actions(batch);
+        let penalty = (a2.clone() - data).square().sum_dim(2) * known;
+        meter.record("critic_penalty", &penalty);
+        let q = critics.lesser_target(join(&batch.s2, a2)) - penalty * c.critic_penalty;
+        let y = batch.r.clone() + batch.not_done.clone() * q * c.discount;
+        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.critic_lr, actor.polyak(step));
+        meter.record("critic_loss", &loss);
+        if actor.due(step) {
+            let output = actor.forward(batch.s.clone());
+            let sa = join(&batch.s, output.mean.clone());
+            let [one, two] = &critics.pair;
+            let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));
+            let q = q1.min_pair(q2);
+            drop(sa);
+            // The sum over components, where `squared_loss` takes their mean.
+            let cloning = Actor::squared_loss(&output, batch.a.clone()) * batch.a.dims()[2] as f64;
+            meter.record("policy_value", &q);
+            meter.record("cloning_loss", &cloning);
+            let loss = cloning * c.actor_penalty - normalised_value(q);
+            drop(output);
+            actor.step(loss, step);
+        }
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.actor.save(&mut state);
+        self.critics.save(&mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.actor.load(state, path)?;
+        self.critics.load(state, path)
+    }
+}
+
+impl PolicyLearner for Rebrac {
+    fn policies(&self) -> Vec<Policy> {
+        self.actor.policies()
+    }
+}

@@ -1,0 +1,128 @@
+//! Choosing among the rows of a batch: what IGDF, OTDF and DmC do with source rows at every step.
+
+use tce_nn::{Tensor, host, tensor};
+
+use crate::buffer::Minibatch;
+use crate::error::LearnError;
+
+/// So many of `others` rows are kept at the share `keep`: ⌊keep · others⌋, at least one.
+pub fn kept_rows(keep: f64, others: usize) -> usize {
+    // .8 · 5 is 4.000…01 or 3.999…9, depending on how it was written.
+    ((keep * others as f64 + 1e-9).floor() as usize).clamp(1, others.max(1))
+}
+
+/// For every member, all target rows of a batch and the `count` others with the greatest `scores`, ascending; equal scores: the
+/// earlier row. `scores` holds one number per row that is not a target row, members one after the other.
+pub fn best_others(target_rows: usize, scores: &[f32], others: usize, count: usize) -> Vec<Vec<usize>> {
+    let choose = |scores: &[f32]| {
+        let mut order: Vec<usize> = (0..others).collect();
+        order.sort_unstable_by(|&a, &b| scores[b].total_cmp(&scores[a]).then(a.cmp(&b)));
+        order.truncate(count);
+        order.sort_unstable();
+        (0..target_rows).chain(order.into_iter().map(|i| target_rows + i)).collect()
+    };
+    scores.chunks(others.max(1)).map(choose).collect()
+}
+
+/// A batch without its worse source rows, and what multiplies each row of L_Q.
+pub struct Selected {
+    /// Target rows, then the source rows that were kept.
+    pub batch: Minibatch,
+    /// `[P, B', 1]`: 1 for target rows.
+    pub weights: Tensor<3>,
+}
+
+impl Selected {
+    /// Keeps the share `keep` of the rows that are not the target's, those with the greatest `scores` (as
+    /// [`best_others`] takes them); row i of them weighs `weight(scores[i])`.
+    pub fn new(batch: &Minibatch, scores: &[f32], keep: f64, weight: impl Fn(f32) -> f32) -> Self {
+        let [p, b, _] = batch.s.dims();
+        let (first, others) = (batch.target_rows, b - batch.target_rows);
+        let rows = best_others(first, scores, others, kept_rows(keep, others));
+        let weigh = |(m, &i): (usize, &usize)| if i < first { 1.0 } else { weight(scores[m * others + i - first]) };
+        let weights: Vec<f32> =
+            (rows.iter().enumerate()).flat_map(|(m, rows)| rows.iter().map(move |i| (m, i))).map(weigh).collect();
+        let kept = rows[0].len();
+        Self { weights: tensor(weights, [p, kept, 1], &batch.s.device()), batch: batch.keep(&rows) }
+    }
+}
+
+/// The numbers of the members' `row_scores` for the rows of `batch` that are not target rows, members one after the other.
+pub fn scores_of_others(members: &[crate::Member], batch: &Minibatch) -> Vec<f32> {
+    let b = batch.s.dims()[1];
+    let of = |(member, picks): (&crate::Member, &[crate::Pick])| -> Vec<f32> {
+        let scores = member.row_scores.as_ref().expect("checked by `need_scores`");
+        picks[batch.target_rows..].iter().map(|pick| scores[pick.row as usize]).collect()
+    };
+    members.iter().zip(batch.picks.chunks(b)).flat_map(of).collect()
+}
+
+/// Refuses members without source rows, which `method` cannot do without.
+pub(crate) fn need_others(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
+    match members.iter().position(|m| m.parts.len() != 2 || m.parts[1].is_empty()) {
+        None => Ok(()),
+        Some(m) => Err(LearnError::invalid(
+            format!("member {m}"),
+            format!("{} tables with rows", m_parts(&members[m])),
+            format!("target rows and source rows: {method} compares the two"),
+            "give source rows too (mixture.source = \"all\", or --extra)",
+        )),
+    }
+}
+
+fn m_parts(member: &crate::Member) -> usize {
+    member.parts.iter().filter(|p| !p.is_empty()).count()
+}
+
+/// Refuses members without a number per source row.
+pub(crate) fn need_scores(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
+    need_others(method, members)?;
+    for (m, member) in members.iter().enumerate() {
+        let found = member.row_scores.as_ref().map_or(0, |s| s.len());
+        if found != member.parts[1].len() || member.row_scores.iter().flat_map(|s| s.iter()).any(|s| !s.is_finite()) {
+            return Err(LearnError::invalid(
+                format!("member {m}, row_scores"),
+                format!("{found} numbers"),
+                format!(
+                    "a finite number for each of the {} source rows: {method} chooses by it",
+                    member.parts[1].len()
+                ),
+                "compute them for these very rows",
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The entries of `x` `[P, B, 1]` from row `first` on, members one after the other.
+pub(crate) fn host_from(x: Tensor<3>, first: usize) -> Vec<f32> {
+    let rows = x.dims()[1];
+    host(x.narrow(1, first, rows - first))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn shares_are_rounded_down_as_published() {
+        assert_eq!((kept_rows(0.8, 128), kept_rows(0.75, 128), kept_rows(0.8, 5), kept_rows(0.1, 5)), (102, 96, 4, 1));
+    }
+
+    proptest! {
+        /// Against the definition: nothing that was left out is better than what was kept.
+        #[test]
+        fn what_is_kept_is_the_best(scores in prop::collection::vec(-3i8..3, 24), target in 0usize..4, count in 1usize..12) {
+            let scores: Vec<f32> = scores.into_iter().map(f32::from).collect();
+            for (rows, scores) in best_others(target, &scores, 12, count).iter().zip(scores.chunks(12)) {
+                prop_assert_eq!(rows.len(), target + count);
+                prop_assert!(rows.windows(2).all(|w| w[0] < w[1]));
+                prop_assert!((0..target).all(|i| rows[i] == i));
+                let kept: Vec<usize> = rows[target..].iter().map(|i| i - target).collect();
+                let worst = kept.iter().map(|&i| scores[i]).fold(f32::INFINITY, f32::min);
+                prop_assert!((0..12).filter(|i| !kept.contains(i)).all(|i| scores[i] <= worst));
+            }
+        }
+    }
+}

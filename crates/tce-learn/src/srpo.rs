@@ -1,0 +1,177 @@
+//! SRPO (Xue et al. 2023) on IQL, as IGDF's authors compare it: rewards are raised where the state looks like one of high value.
+//!
+//! ```text
+//! rows of a batch ranked by V(s): the best share ρ gets label 1, the rest 0
+//! L_D = BCE-with-logits(D(s), label)                                               → D
+//! r   ← r + λ ln clip(x, 1/c, c),   x = exp D(s) = p/(1 - p), the odds             then a step of IQL ([`crate::iql`])
+//! ```
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | λ | `lambda` | .1 | IGDF's repository (some tasks .3) |
+//! | ρ | `share` | .5 | the same (some tasks .2) |
+//! | c | `clip` | 10 | the same |
+//! | - | `hidden` | 256, 256 ReLU | the same |
+//! | - | `lr` | 1e-3 | the same |
+//! | - | `mode` | corrected | published: x is the logit D(s) itself |
+//!
+//! **Published**: the logit is clamped where the odds are meant. Every state with D(s) ≤ .1 (odds below 1.1) then loses λ ln 10,
+//! however unlike it is, and ln of a logit grows hardly at all.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
+
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::{LearnError, within};
+use crate::iql::{Iql, IqlConfig};
+use crate::losses::binary_cross_entropy;
+use crate::mode::Mode;
+use crate::policy::Policy;
+use crate::regulariser::Regulariser;
+use crate::selection::{best_others, kept_rows};
+use crate::training::{Learner, Meter, PolicyLearner};
+
+/// The configuration of [`Srpo`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SrpoConfig {
+    /// What is clamped.
+    pub mode: Mode,
+    /// λ
+    pub lambda: f64,
+    /// ρ
+    pub share: f64,
+    /// c
+    pub clip: f64,
+    /// Hidden layers of the discriminator.
+    pub hidden: Vec<usize>,
+    /// Learning rate of the discriminator, constant.
+    pub lr: f64,
+}
+
+impl Default for SrpoConfig {
+    fn default() -> Self {
+        Self { mode: Mode::default(), lambda: 0.1, share: 0.5, clip: 10.0, hidden: vec![256, 256], lr: 1e-3 }
+    }
+}
+
+impl SrpoConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("lambda", self.lambda, 0.0..=1e6)?;
+        within("share", self.share, 0.0..=1.0)?;
+        within("clip", self.clip, 1.0..=1e6)?;
+        within("lr", self.lr, 0.0..=1.0)
+    }
+}
+
+/// SRPO of a population.
+pub struct Srpo {
+    config: SrpoConfig,
+    iql: Iql,
+    discriminator: Trained<Mlp>,
+}
+
+impl Srpo {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If a configuration cannot be used.
+    pub fn new(
+        buffer: &Buffer,
+        config: &SrpoConfig,
+        iql: &IqlConfig,
+        regulariser: Regulariser,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
+        config.check()?;
+        let net = MlpConfig::relu(buffer.inputs().len(), &config.hidden, 1);
+        let net = net.init(&buffer.streams(), "srpo", &device.clone().autodiff());
+        let iql = Iql::new(buffer, iql, regulariser, steps, device)?;
+        Ok(Self { config: config.clone(), iql, discriminator: Trained::new(net) })
+    }
+}
+
+/// 1 for the share `share` of the rows with the greatest values, per member; `[P, B, 1]` as `values`.
+pub fn high_value_labels(values: Tensor<3>, share: f64) -> Tensor<3> {
+    let ([p, b, _], device) = (values.dims(), values.device());
+    let mut labels = vec![0.0; p * b];
+    for (labels, best) in labels.chunks_mut(b).zip(best_others(0, &host(values), b, kept_rows(share, b))) {
+        best.into_iter().for_each(|i| labels[i] = 1.0);
+    }
+    tensor(labels, [p, b, 1], &device)
+}
+
+/// λ ln clip(x, 1/c, c) for the logits of the discriminator.
+pub fn reward_shift(logits: Tensor<3>, config: &SrpoConfig) -> Tensor<3> {
+    let (low, high) = (1.0 / config.clip, config.clip);
+    let log = match config.mode {
+        Mode::Published => logits.clamp(low, high).log(),
+        // ln clip(exp D, 1/c, c) without the detour, which overflows.
+        Mode::Corrected => logits.clamp(low.ln(), high.ln()),
+    };
+    log * config.lambda
+}
+
+impl Learner for Srpo {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, iql, discriminator } = self;
+        let labels = high_value_labels(iql.values(batch.s.clone()), c.share);
+        let loss = binary_cross_entropy(discriminator.net().forward(batch.s.clone()), labels);
+        meter.record("discriminator_loss", &loss);
+        discriminator.step(loss.sum(), c.lr);
+        let shift = reward_shift(discriminator.net().valid().forward(batch.s.clone()), c);
+        meter.record("reward_shift", &shift);
+        iql.step(&Minibatch { r: batch.r.clone() + shift, ..batch.clone() }, None, step, meter);
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = self.iql.state();
+        self.discriminator.save("srpo", &mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.iql.restore(state, path)?;
+        self.discriminator.load("srpo", state, path)
+    }
+}
+
+impl PolicyLearner for Srpo {
+    fn policies(&self) -> Vec<Policy> {
+        self.iql.policies()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::cpu;
+
+    #[test]
+    fn the_modes_differ_in_what_is_clamped() {
+        let logits = [-5.0f32, 0.05, 1.0, 20.0];
+        let shift = |mode| {
+            let config = SrpoConfig { mode, lambda: 0.3, ..SrpoConfig::default() };
+            host(reward_shift(tensor(logits.to_vec(), [1, 4, 1], &cpu()), &config))
+        };
+        for (k, &x) in logits.iter().enumerate() {
+            let published = 0.3 * x.clamp(0.1, 10.0).ln();
+            let corrected = 0.3 * x.exp().clamp(0.1, 10.0).ln();
+            assert!((shift(Mode::Published)[k] - published).abs() < 1e-6);
+            assert!((shift(Mode::Corrected)[k] - corrected).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn the_upper_half_is_labelled() {
+        let values = tensor(vec![1.0, 4.0, 3.0, 2.0, 0.0, -1.0, -3.0, -2.0], [2, 4, 1], &cpu());
+        assert_eq!(host(high_value_labels(values, 0.5)), [0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0]);
+    }
+}

@@ -1,0 +1,160 @@
+//! TD3+BC (Fujimoto and Gu 2021): a deterministic actor-critic whose policy is held to the actions of the data.
+//!
+//! ```text
+//! a'  = clip(π'(s') + clip(σ n, ±c), ±1);  y = r + γ (1 - terminal) min(Q1', Q2')(s', a')
+//! L_Q = mean (Q1(s, a) - y)² + mean (Q2(s, a) - y)²                               → Q1, Q2
+//! every d-th step:  L_π = mean ℓ(s, a) - (α / mean |Q1(s, π(s))|) mean Q1(s, π(s))   → π;  Q', π' follow
+//! ```
+//!
+//! ℓ = (π(s) - a)², mean over components ([`crate::actor`]); the divisor of α gets no gradient.
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | α | `alpha` | 2.5 | Fujimoto and Gu |
+//! | γ | `discount` | .99 | the same |
+//! | σ, c, d, ρ | `delay` | .2, .5, 2, .005 | [`crate::deterministic`] |
+//! | - | `critic_lr` | 3e-4 | the same |
+//! | - | `hidden` | 256, 256 ReLU | the same |
+//! | - | `actor` | 256-256, 3e-4, constant | the same |
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
+
+use crate::actor::{Actor, ActorConfig};
+use crate::buffer::{Buffer, Minibatch};
+use crate::critic::Twins;
+use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::error::{LearnError, within};
+use crate::losses::member_mean;
+use crate::policy::Policy;
+use crate::training::{Learner, Meter, PolicyLearner};
+
+/// The configuration of [`Td3Bc`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Td3BcConfig {
+    /// α
+    pub alpha: f64,
+    /// γ
+    pub discount: f64,
+    /// σ, c, d, ρ
+    pub delay: DelayConfig,
+    /// Learning rate of the critics, constant.
+    pub critic_lr: f64,
+    /// Hidden layers of the critics.
+    pub hidden: Vec<usize>,
+    /// The policy; its `form` is tanh mean.
+    pub actor: ActorConfig,
+}
+
+impl Default for Td3BcConfig {
+    fn default() -> Self {
+        Self {
+            alpha: 2.5,
+            discount: 0.99,
+            delay: DelayConfig::default(),
+            critic_lr: 3e-4,
+            hidden: vec![256, 256],
+            actor: ActorConfig { cosine: false, ..ActorConfig::default() },
+        }
+    }
+}
+
+impl Td3BcConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("alpha", self.alpha, 0.0..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
+    }
+}
+
+/// TD3+BC of a population.
+pub struct Td3Bc {
+    config: Td3BcConfig,
+    actor: DelayedActor,
+    critics: Twins,
+}
+
+impl Td3Bc {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used.
+    pub fn new(buffer: &Buffer, config: &Td3BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
+        config.check()?;
+        let (inputs, train) = (buffer.inputs().len(), device.clone().autodiff());
+        Ok(Self {
+            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
+            critics: Twins::new(inputs, buffer.act_dim(), &config.hidden, &buffer.streams(), &train),
+            config: config.clone(),
+        })
+    }
+}
+
+/// mean Q / mean |Q| per member, the divisor without gradient: the same scale whatever the rewards' is. `q` `[P, B, 1]`.
+pub fn normalised_value(q: Tensor<3>) -> Tensor<3> {
+    let scale = member_mean(q.clone().inner().abs()).clamp_min(1e-8);
+    member_mean(q) / Tensor::from_inner(scale)
+}
+
+impl Learner for Td3Bc {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, actor, critics } = self;
+        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
+        let q = critics.lesser_target(join(&batch.s2, actor.next_action(batch.s2.clone(), step)));
+        let y = batch.r.clone() + batch.not_done.clone() * q * c.discount;
+        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.critic_lr, actor.polyak(step));
+        meter.record("critic_loss", &loss);
+        if actor.due(step) {
+            let output = actor.forward(batch.s.clone());
+            let q = critics.pair[0].frozen(join(&batch.s, output.mean.clone()));
+            let cloning = Actor::squared_loss(&output, batch.a.clone());
+            meter.record("policy_value", &q);
+            meter.record("cloning_loss", &cloning);
+            let loss = cloning - normalised_value(q) * c.alpha;
+            drop(output);
+            actor.step(loss, step);
+        }
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.actor.save(&mut state);
+        self.critics.save(&mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.actor.load(state, path)?;
+        self.critics.load(state, path)
+    }
+}
+
+impl PolicyLearner for Td3Bc {
+    fn policies(&self) -> Vec<Policy> {
+        self.actor.policies()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::{cpu, host, tensor};
+
+    #[test]
+    fn the_value_is_in_units_of_its_own_magnitude() {
+        let q = tensor(vec![2.0, -1.0, 5.0], [1, 3, 1], &cpu().autodiff()).require_grad();
+        let value = normalised_value(q.clone());
+        assert!((host(value.clone().inner())[0] - 6.0 / 8.0).abs() < 1e-6);
+        // mean |Q| = 8/3 is a constant to the gradient: 1/3 · 3/8.
+        let gradient = host(q.grad(&value.sum().backward()).unwrap());
+        assert!(gradient.iter().all(|g| (g - 0.125).abs() < 1e-6), "{gradient:?}");
+    }
+}
