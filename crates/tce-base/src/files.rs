@@ -88,6 +88,15 @@ fn flush_directory(path: &Path) -> Result<(), FileError> {
     Ok(())
 }
 
+/// Gives the complete file `own`, flushed to disk, the name `target` on the same file system, in place of what had it.
+///
+/// # Errors
+/// If it cannot be renamed.
+pub fn move_into_place(own: &Path, target: &Path) -> Result<(), FileError> {
+    fs::rename(own, target).map_err(|e| FileError::new(target, "rename into place", e))?;
+    flush_directory(target)
+}
+
 /// Gives the complete file `own` the name `target`, too, unless that name is taken: of several that want it, the first one gets it.
 /// Whether this one did.
 ///

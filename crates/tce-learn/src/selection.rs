@@ -110,6 +110,29 @@ mod tests {
         assert_eq!((kept_rows(0.8, 128), kept_rows(0.75, 128), kept_rows(0.8, 5), kept_rows(0.1, 5)), (102, 96, 4, 1));
     }
 
+    /// Two members; every row carries its own number as state and reward, so that it can be told where it went.
+    #[test]
+    fn rows_keep_their_weights() {
+        let column = |v: &[f32]| tensor(v.to_vec(), [2, 5, 1], &tce_nn::cpu());
+        let numbers: Vec<f32> = (0..10).map(|i| i as f32).collect();
+        let pick = |i: usize| crate::Pick { part: u32::from(i % 5 >= 2), row: i as u32 };
+        let batch = Minibatch {
+            s: column(&numbers),
+            a: column(&numbers),
+            r: column(&numbers),
+            s2: column(&numbers),
+            not_done: column(&numbers),
+            target_rows: 2,
+            picks: (0..10).map(pick).collect(),
+        };
+        // Rows 2, 3, 4 of each member are the others.
+        let kept = Selected::new(&batch, &[0.5, -1.0, 2.0, 3.0, 1.0, 2.0], 0.7, |score| 10.0 * score);
+        assert_eq!(host(kept.batch.s.clone()), [0.0, 1.0, 2.0, 4.0, 5.0, 6.0, 7.0, 9.0]);
+        assert_eq!(host(kept.batch.r.clone()), host(kept.batch.s2.clone()));
+        assert_eq!(host(kept.weights), [1.0, 1.0, 5.0, 20.0, 1.0, 1.0, 30.0, 20.0]);
+        assert_eq!((kept.batch.target_rows, kept.batch.picks[3].row), (2, 4));
+    }
+
     proptest! {
         /// Against the definition: nothing that was left out is better than what was kept.
         #[test]

@@ -173,6 +173,20 @@ fn the_published_otdf_does_not_improve() {
     assert!(score < 0.2, "{score}");
 }
 
+/// Before its first step, IGDF's two modes differ in the encoders and in nothing else.
+#[test]
+fn the_published_igdf_chooses_by_networks_as_they_were_drawn() {
+    let buffer = Buffer::new(vec![member(1)], 64).unwrap();
+    let state = |mode| method("igdf", mode, &buffer, 10).state();
+    let (published, corrected) = (state(Mode::Published), state(Mode::Corrected));
+    assert_eq!(published.metadata["adam.igdf"], "0");
+    assert_eq!(corrected.metadata["adam.igdf"], "300");
+    let differs = |name: &String| published.tensors[name] != corrected.tensors[name];
+    for name in published.tensors.keys() {
+        assert_eq!(differs(name), name.starts_with("igdf."), "{name}");
+    }
+}
+
 #[test]
 fn whatever_is_learned_can_be_resumed_on_any_number_of_threads() {
     let buffer = Buffer::new(vec![member(1), member(2)], 32).unwrap();

@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{Progress, Rng, Streams, sha256_file, sha256_hex};
+use tce_base::{Progress, Rng, Streams, move_into_place, sha256_file, sha256_hex};
 use tce_data::{Agent, Quality, ReferenceScores, ScoreTable, Shift, Transitions, reference_scores, save_d4rl};
 use tce_learn::Policy;
 use tce_sim::{Actor, CollectOptions, EpisodeResult};
 
 use crate::PROGRAM;
 use crate::error::{Error, Result};
+use crate::scratch::Scratch;
 use crate::zoo::Exhibit;
 
 /// A policy as the simulator wants it.
@@ -130,8 +131,12 @@ impl Recipe {
         let attributes = self.attributes()?;
         let key = sha256_hex(serde_json::to_string(&attributes).expect("strings").as_bytes());
         let path = directory.join(format!("{name}-{}.hdf5", &key[..12]));
+        Scratch::tidy(directory);
         if !path.exists() {
-            save_d4rl(&path, &self.collect()?, &attributes, &[])?;
+            let scratch = Scratch::new(directory)?;
+            let own = scratch.file("rows.hdf5");
+            save_d4rl(&own, &self.collect()?, &attributes, &[])?;
+            move_into_place(&own, &path)?;
         }
         Ok(path)
     }

@@ -19,6 +19,7 @@ mod metrics;
 mod mixture;
 mod output;
 mod pipeline;
+mod scratch;
 mod stage;
 mod stand_ins;
 mod sweep;

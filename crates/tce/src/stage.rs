@@ -27,7 +27,7 @@ use crate::metrics::Metrics;
 /// Changes when the same specification would give other bytes.
 const FORMAT: u32 = 2;
 /// Where attempts are, in a stage.
-const ATTEMPTS: &str = "attempts";
+pub(crate) const ATTEMPTS: &str = "attempts";
 
 /// What marks a stage as done.
 #[derive(Serialize, Deserialize)]
@@ -315,7 +315,7 @@ impl Owner {
     }
 
     /// The one in an attempt's name.
-    fn of(attempt: &Path) -> Option<Self> {
+    pub(crate) fn of(attempt: &Path) -> Option<Self> {
         let name = attempt.file_name()?.to_str()?;
         let mut parts = name.rsplitn(4, '.');
         let _count = parts.next()?;
@@ -325,7 +325,7 @@ impl Owner {
     }
 
     /// Whether it is certainly gone. Of another machine nothing is certain.
-    fn dead(&self) -> bool {
+    pub(crate) fn dead(&self) -> bool {
         let known = self.started != 0 && self.machine == machine();
         known && started(self.process) != Some(self.started)
     }

@@ -23,7 +23,7 @@ use crate::task::parse_environment;
 #[derive(Debug, Args)]
 pub struct Learn {
     /// Print all learners: what they are, whose, and how their public code differs.
-    #[arg(long, exclusive = true)]
+    #[arg(long)]
     list: bool,
     /// The rows to learn from (HDF5). With --extra, half of every batch comes from here.
     #[arg(long, value_name = "FILE", required_unless_present = "list")]
