@@ -21,6 +21,7 @@ fn main() {
         parts: parts.clone(),
         standardizer: standardizer.clone(),
         reward_scale: 1.0,
+        row_scores: None,
     };
     let default = PairConfig::default();
     for (name, model) in [

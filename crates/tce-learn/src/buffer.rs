@@ -15,6 +15,7 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{Standardizer, Transitions};
+use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{Device, Tensor, tensor};
 
 use crate::error::LearnError;
@@ -31,6 +32,9 @@ pub struct Member {
     pub standardizer: Standardizer,
     /// Factor on every reward; 1 for none, see [`return_range_scale`].
     pub reward_scale: f32,
+    /// One number per row of part 1, where an algorithm weighs or filters these rows: a transport cost, a score. A batch's rows
+    /// find theirs by [`Minibatch::picks`].
+    pub row_scores: Option<Arc<Vec<f32>>>,
 }
 
 /// Members side by side, with the same dimensions and batch size.
@@ -72,6 +76,42 @@ pub struct Minibatch {
     pub picks: Vec<Pick>,
 }
 
+impl Minibatch {
+    /// The rows `rows[m]` of every member m, in that order: a batch of what a filter leaves. Give target rows first, as the
+    /// batch has them; ascending indices do.
+    ///
+    /// # Panics
+    /// If there is not one list per member, the lists are empty or differ in length, or an index is out of range.
+    pub fn keep(&self, rows: &[Vec<usize>]) -> Self {
+        let [p, b, _] = self.s.dims();
+        let kept = rows.first().map_or(0, Vec::len);
+        assert!(
+            kept > 0 && rows.len() == p && rows.iter().all(|r| r.len() == kept),
+            "one list of rows per member, all of one length"
+        );
+        let own = |m: usize| move |&i: &usize| (i < b).then_some(m * b + i).expect("a row of the batch");
+        let picks: Vec<_> =
+            rows.iter().enumerate().flat_map(|(m, r)| r.iter().map(own(m)).map(|at| self.picks[at])).collect();
+        let target = |picks: &[Pick]| picks.iter().take_while(|p| p.part == 0).count();
+        let target_rows = picks.chunks(kept).map(target).min().unwrap_or(0);
+        let indices: Vec<i64> = rows.iter().flatten().map(|&i| i as i64).collect();
+        let indices = Tensor::<3, Int>::from_data(TensorData::new(indices, [p, kept, 1]), &self.s.device());
+        let take = |t: &Tensor<3>| {
+            let width = t.dims()[2];
+            t.clone().gather(1, indices.clone().expand([p, kept, width]))
+        };
+        Self {
+            s: take(&self.s),
+            a: take(&self.a),
+            r: take(&self.r),
+            s2: take(&self.s2),
+            not_done: take(&self.not_done),
+            target_rows,
+            picks,
+        }
+    }
+}
+
 impl Buffer {
     /// A buffer that draws `batch` rows per member and step.
     ///
@@ -105,6 +145,12 @@ impl Buffer {
                 let expected = format!("{}", dims.0);
                 return Err(LearnError::invalid(field, member.standardizer.dim(), expected, "fit it on this data"));
             }
+            let rows = member.parts.get(1).map_or(0, |p| p.len());
+            if let Some(scores) = member.row_scores.as_ref().filter(|s| s.len() != rows) {
+                let (field, found) = (format!("member {k}, row_scores"), format!("{} numbers", scores.len()));
+                let expected = format!("{rows}, one per row of part 1");
+                return Err(LearnError::invalid(field, found, expected, "compute them for these rows"));
+            }
             let live = member.parts.iter().filter(|p| !p.is_empty()).count();
             if batch < live {
                 let expected = format!("at least {live}, one row per part");
@@ -128,7 +174,7 @@ impl Buffer {
         let standardizer = Standardizer { dead, ..Standardizer::identity(dims.0) };
         let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
         let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
-        let member = Member { streams, parts, standardizer, reward_scale: 1.0 };
+        let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
         Self { members: vec![member], batch, inputs, act_dim: dims.1, stream: "batch" }
     }
 
@@ -172,7 +218,7 @@ impl Buffer {
 
     /// The same members with the target part only, and another batch size.
     pub fn target_only(&self, batch: usize) -> Result<Self, LearnError> {
-        let only = |m: &Member| Member { parts: m.parts[..1].to_vec(), ..m.clone() };
+        let only = |m: &Member| Member { parts: m.parts[..1].to_vec(), row_scores: None, ..m.clone() };
         Ok(Self { inputs: self.inputs.clone(), ..Self::new(self.members.iter().map(only).collect(), batch)? })
     }
 
@@ -313,7 +359,7 @@ mod tests {
     fn member(seed: u64, parts: Vec<Transitions>) -> Member {
         let standardizer = Standardizer::fit(&parts[0].observations, 2);
         let parts = parts.into_iter().map(Arc::new).collect();
-        Member { streams: Streams::new(seed), parts, standardizer, reward_scale: 2.0 }
+        Member { streams: Streams::new(seed), parts, standardizer, reward_scale: 2.0, row_scores: None }
     }
 
     #[test]
@@ -330,6 +376,25 @@ mod tests {
             assert_eq!((a[k], r[k], nd[k]), (-x, 2.0 * x, f32::from(pick.row != 1)));
             assert_eq!((s[k], s2[k]), ((x - z.mean[0]) / z.std[0], (x + 1.0 - z.mean[0]) / z.std[0]));
         }
+    }
+
+    #[test]
+    fn kept_rows_stay_whole() {
+        let buffer =
+            Buffer::new(vec![member(1, vec![table(), table()]), member(2, vec![table(), table()])], 8).unwrap();
+        let batch = buffer.sample(0, &cpu());
+        let rows = [vec![0, 1, 3, 5], vec![2, 3, 6, 7]];
+        let kept = batch.keep(&rows);
+        assert_eq!((kept.s.dims(), kept.a.dims(), kept.target_rows), ([2, 4, 1], [2, 4, 1], 2));
+        let columns = |b: &Minibatch| [&b.s, &b.a, &b.r, &b.s2, &b.not_done].map(|t| host(t.clone()));
+        let (all, some) = (columns(&batch), columns(&kept));
+        for (k, at) in rows.iter().enumerate().flat_map(|(m, r)| r.iter().map(move |i| 8 * m + i)).enumerate() {
+            assert_eq!(kept.picks[k], batch.picks[at]);
+            for (some, all) in some.iter().zip(&all) {
+                assert_eq!(some[k], all[at]);
+            }
+        }
+        assert_eq!(batch.keep(&[vec![0, 1], vec![1, 2]]).target_rows, 2, "target rows alone");
     }
 
     #[test]
@@ -354,6 +419,8 @@ mod tests {
         }
         let mut without_target = member(1, vec![table()]);
         without_target.parts.insert(0, Arc::new(empty));
+        let scored = Member { row_scores: Some(Arc::new(vec![0.0; 5])), ..member(1, vec![table(), table()]) };
+        assert!(Buffer::new(vec![scored], 4).unwrap_err().to_string().contains("member 0, row_scores"));
         assert!(Buffer::new(vec![without_target], 4).unwrap_err().to_string().contains("target"));
     }
 

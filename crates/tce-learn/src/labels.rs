@@ -123,6 +123,7 @@ impl LabelModels {
                 standardizer: Standardizer::fit(&target.observations, target.obs_dim),
                 parts: vec![Arc::new(target.select(train))],
                 reward_scale: 1.0,
+                row_scores: None,
             });
         }
         let buffer = Buffer::new(training, config.batch)?.with_stream("label batch");

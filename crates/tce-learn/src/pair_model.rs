@@ -283,6 +283,7 @@ mod tests {
             parts: vec![Arc::new(t.clone())],
             standardizer: standardizer.clone(),
             reward_scale: 1.0,
+            row_scores: None,
         };
         Buffer::new(vec![member(1), member(2)], 16).unwrap()
     }

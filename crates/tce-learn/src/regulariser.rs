@@ -207,6 +207,7 @@ mod tests {
             parts: vec![Arc::new(t)],
             standardizer: Standardizer::identity(2),
             reward_scale: 1.0,
+            row_scores: None,
         };
         let buffer = Buffer::new(vec![member], 1).unwrap();
         let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::default() };

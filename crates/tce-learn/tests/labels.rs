@@ -29,6 +29,7 @@ fn members(seeds: &[u64]) -> Vec<Member> {
         parts: vec![data.clone()],
         standardizer: Standardizer::identity(3),
         reward_scale: 7.0,
+        row_scores: None,
     };
     seeds.iter().map(member).collect()
 }

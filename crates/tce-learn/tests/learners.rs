@@ -19,7 +19,7 @@ fn member(seed: u64, data: &Arc<Transitions>, standardised: bool) -> Member {
     let dim = data.obs_dim;
     let standardizer =
         if standardised { Standardizer::fit(&data.observations, dim) } else { Standardizer::identity(dim) };
-    Member { streams: Streams::new(seed), parts: vec![data.clone()], standardizer, reward_scale: 1.0 }
+    Member { streams: Streams::new(seed), parts: vec![data.clone()], standardizer, reward_scale: 1.0, row_scores: None }
 }
 
 fn run<L: Learner>(learner: &mut L, buffer: &Buffer, steps: u64) -> tce_learn::Report {

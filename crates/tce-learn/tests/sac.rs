@@ -30,6 +30,7 @@ fn buffer(seeds: u64, batch: usize) -> Buffer {
         parts: vec![rows.clone()],
         standardizer: Standardizer::identity(1),
         reward_scale: 1.0,
+        row_scores: None,
     };
     Buffer::new((0..seeds).map(member).collect(), batch).unwrap()
 }

@@ -168,6 +168,7 @@ fn members(seeds: u64) -> Vec<Member> {
         parts: parts.clone(),
         standardizer: Standardizer::identity(OBS),
         reward_scale: 1.0,
+        row_scores: None,
     };
     (0..seeds).map(member).collect()
 }

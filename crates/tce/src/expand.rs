@@ -63,6 +63,7 @@ pub fn label_models(
         parts: vec![target.clone()],
         standardizer: Standardizer::identity(target.obs_dim),
         reward_scale: 1.0,
+        row_scores: None,
     };
     let members: Vec<_> = seeds.iter().map(member).collect();
     let file = "labels.safetensors";

@@ -30,6 +30,8 @@ pub struct MemberData {
     pub target: Arc<Transitions>,
     /// Source or generated rows.
     pub extra: Option<Arc<Transitions>>,
+    /// One number per row of `extra`, for algorithms that weigh or filter these rows.
+    pub row_scores: Option<Arc<Vec<f32>>>,
     /// Tables with real trajectories, whose returns the reward scale is taken from.
     pub trajectories: Vec<Arc<Transitions>>,
 }
@@ -167,7 +169,13 @@ fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
         }
     };
     let parts = std::iter::once(target).chain(data.extra.clone()).collect();
-    Ok(Member { streams: Streams::new(data.seed), parts, standardizer, reward_scale })
+    Ok(Member {
+        streams: Streams::new(data.seed),
+        parts,
+        standardizer,
+        reward_scale,
+        row_scores: data.row_scores.clone(),
+    })
 }
 
 /// Evaluates every member's policy with the member's own streams.

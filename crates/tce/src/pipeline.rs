@@ -125,6 +125,7 @@ pub fn run(
         seed,
         target: target.clone(),
         extra: extra.as_ref().map(|e| e[m].clone()),
+        row_scores: None,
         trajectories: trajectories.clone(),
     };
     let data: Vec<_> = seeds.iter().enumerate().map(data).collect();

@@ -90,6 +90,7 @@ impl Learn {
             seed,
             target: target.clone(),
             extra: extra.clone(),
+            row_scores: None,
             trajectories: vec![target.clone()],
         };
         let data = seeds.iter().map(member).collect();
