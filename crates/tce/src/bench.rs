@@ -313,7 +313,7 @@ fn sample() -> Body {
     let labels = uniform_labels(&Streams::new(0), "y", rows, 0.2);
     let flops = 2.0 * score_products(&spec).1 * sampler.evaluations() as f64;
     Body::new("rows", rows as f64, flops, move || {
-        let request = Request { name: "bench", rows, condition: &labels, start: None, kept: None };
+        let request = Request { name: "bench", rows, condition: &labels, guidance: None, start: None, kept: None };
         drop(model.sample(request, &sampler, &[Streams::new(0)], None).expect("a good request"));
     })
 }
