@@ -50,12 +50,12 @@ impl Default for DensityOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DensityScale {
-    /// min ρ.
-    pub least: f64,
+    /// min ρ, rounded up: numbers that a file gives back as they were.
+    pub least: f32,
     /// The smallest distance to the target that is not 0.
-    pub target_floor: f64,
+    pub target_floor: f32,
     /// The smallest distance to the source that is not 0.
-    pub source_floor: f64,
+    pub source_floor: f32,
 }
 
 /// The scores of a pair of data sets.
@@ -105,7 +105,11 @@ pub fn density_scores(
     let mut scale = DensityScale { least: 0.0, target_floor: floor(&to_target), source_floor: floor(&to_source) };
     let [of_source, of_target] =
         [0, 1].map(|i| scale.ratios(&to_target[i], &to_source[i], options.squared).collect::<Vec<_>>());
-    scale.least = of_source.iter().chain(&of_target).copied().fold(f64::INFINITY, f64::min);
+    let least = of_source.iter().chain(&of_target).copied().fold(f64::INFINITY, f64::min);
+    scale.least = least as f32;
+    if (scale.least as f64) < least {
+        scale.least = scale.least.next_up();
+    }
     let scores = |ratios: Vec<f64>| ratios.into_iter().map(|rho| scale.score(rho)).collect();
     Ok(DensityScores { source: scores(of_source), target: scores(of_target), scale })
 }
@@ -139,21 +143,21 @@ fn at(k: usize) -> NeighbourOptions {
 }
 
 /// The smallest distance that is not 0; 1 where all are.
-fn floor(distances: &[Vec<f32>]) -> f64 {
+fn floor(distances: &[Vec<f32>]) -> f32 {
     let least = distances.iter().flatten().filter(|d| **d > 0.0).fold(f32::INFINITY, |a, &b| a.min(b));
-    if least.is_finite() { least as f64 } else { 1.0 }
+    if least.is_finite() { least } else { 1.0 }
 }
 
 impl DensityScale {
     fn ratios<'a>(&self, to_target: &'a [f32], to_source: &'a [f32], squared: bool) -> impl Iterator<Item = f64> + 'a {
         let (target_floor, source_floor) = (self.target_floor, self.source_floor);
         let factor = if squared { 2.0 } else { 1.0 };
-        let log = |d: f32, floor: f64| (d as f64).max(floor).ln();
+        let log = |d: f32, floor: f32| (d.max(floor) as f64).ln();
         to_target.iter().zip(to_source).map(move |(&t, &s)| factor * (log(t, target_floor) - log(s, source_floor)))
     }
 
     fn score(&self, rho: f64) -> f32 {
-        (1.0 / (1.0 + (rho - self.least).max(0.0))) as f32
+        (1.0 / (1.0 + (rho - self.least as f64).max(0.0))) as f32
     }
 }
 
@@ -245,7 +249,8 @@ mod tests {
         let rho = |reference: usize| {
             let options = DensityOptions { neighbour: 10, reference, squared: false };
             let scores = density_scores(&s, &t, &options, &Streams::new(0)).unwrap();
-            let rho: Vec<f64> = scores.source.iter().map(|&v| 1.0 / v as f64 - 1.0 + scores.scale.least).collect();
+            let rho: Vec<f64> =
+                scores.source.iter().map(|&v| 1.0 / v as f64 - 1.0 + scores.scale.least as f64).collect();
             rho
         };
         let (exact, thinned) = (rho(n), rho(n / 8));

@@ -8,6 +8,7 @@
 //! | weighted imitation of actions | [`actor`], [`losses`] |
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
+//! | DmC: scored rows, filtered and weighed | [`dmc`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
 
@@ -17,6 +18,7 @@ mod blocks;
 mod buffer;
 pub mod critic;
 pub mod cvae;
+pub mod dmc;
 mod error;
 pub mod import;
 pub mod iql;
@@ -32,6 +34,7 @@ pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
 pub use blocks::map_rows;
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};
+pub use dmc::{Dmc, DmcConfig, DmcMode};
 pub use error::LearnError;
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, train_labels};

@@ -2,9 +2,9 @@
 //! value comes from is told by [`crate::layers`].
 
 use serde::{Deserialize, Serialize};
-use tce_data::ScoreTable;
+use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target};
-use tce_learn::{BcConfig, IqlConfig, LabelConfig, RegulariserConfig, RegulariserKind};
+use tce_learn::{BcConfig, DmcConfig, IqlConfig, LabelConfig, RegulariserConfig, RegulariserKind};
 
 use crate::error::{Error, Result};
 
@@ -18,6 +18,7 @@ pub struct Config {
     pub generator: GeneratorConfig,
     pub filter: FilterConfig,
     pub labels: LabelsConfig,
+    pub joint: JointConfig,
     pub mixture: MixtureConfig,
     pub learner: LearnerConfig,
     pub evaluation: EvaluationConfig,
@@ -81,6 +82,71 @@ pub enum Terminal {
     Learned,
 }
 
+/// The network over whole transitions, for `mixture.generated` = synther and dmc, and how it is sampled.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct JointConfig {
+    pub process: Process,
+    pub sampler: Sampler,
+    pub target: Target,
+    pub width: usize,
+    pub embedding: usize,
+    pub blocks: usize,
+    pub steps: u64,
+    pub batch: usize,
+    pub learning_rate: f64,
+    pub schedule: Schedule,
+    pub ema: f64,
+    pub rows: usize,
+    pub guidance: GuidanceConfig,
+    pub scores: DensityOptions,
+}
+
+impl JointConfig {
+    /// The keys that decide generated rows of this kind, or the scores of source rows alone: what a run's identity depends on.
+    /// None where no key does.
+    pub fn used(&self, generated: GeneratedRows, algorithm: Algorithm) -> Option<serde_json::Value> {
+        let mut used = serde_json::json!(self);
+        match (generated, algorithm) {
+            (GeneratedRows::Dmc, _) => {}
+            (GeneratedRows::Synther, _) => {
+                let keys = used.as_object_mut().expect("a table");
+                keys.remove("guidance");
+                keys.remove("scores");
+            }
+            (_, Algorithm::Dmc) => used = serde_json::json!({ "scores": self.scores }),
+            _ => return None,
+        }
+        Some(used)
+    }
+}
+
+/// How scores guide DmC's generator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct GuidanceConfig {
+    pub dropout: f64,
+    pub weight: f64,
+    pub from: f64,
+    pub rescore: bool,
+}
+
+/// Which generated rows join the target rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GeneratedRows {
+    /// None.
+    None,
+    /// TCE's: states, successors, filter, labels (`generator`, `filter`, `labels`).
+    Tce,
+    /// Whole transitions like the target's (`joint`).
+    Synther,
+    /// Whole transitions like the most target-like ones of source and target (`joint`).
+    Dmc,
+}
+
 /// Which source rows join the target rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -102,7 +168,7 @@ pub enum SourceRows {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct MixtureConfig {
-    pub generated: bool,
+    pub generated: GeneratedRows,
     pub source: SourceRows,
     pub lambda: f64,
 }
@@ -115,6 +181,8 @@ pub enum Algorithm {
     Bc,
     /// Implicit Q-learning.
     Iql,
+    /// DmC's: implicit Q-learning on filtered rows, weighed by their scores.
+    Dmc,
 }
 
 /// The learner; the keys of the other algorithm are not looked at.
@@ -129,13 +197,14 @@ pub struct LearnerConfig {
     pub top: f64,
     pub iql: IqlConfig,
     pub bc: BcConfig,
+    pub dmc: DmcConfig,
     pub behaviour: RegulariserConfig,
 }
 
 impl LearnerConfig {
     /// The keys that the algorithm looks at: what a run's identity depends on.
     pub fn used(&self) -> serde_json::Value {
-        let Self { algorithm, steps, batch, standardise, top, iql, bc, behaviour } = self;
+        let Self { algorithm, steps, batch, standardise, top, iql, bc, dmc, behaviour } = self;
         let mut used = serde_json::json!({
             "algorithm": algorithm, "steps": steps, "batch": batch, "standardise": standardise,
         });
@@ -149,6 +218,11 @@ impl LearnerConfig {
                 if iql.regulariser != RegulariserKind::None {
                     used["behaviour"] = serde_json::json!(behaviour);
                 }
+            }
+            Algorithm::Dmc => {
+                used["iql"] = serde_json::json!(dmc.iql(iql));
+                used["dmc"] = serde_json::json!(dmc);
+                used["behaviour"] = serde_json::json!(dmc.behaviour(behaviour));
             }
         }
         used
@@ -186,10 +260,41 @@ impl Config {
         ] {
             within(key, value as f64, 1.0, 1e12)?;
         }
-        if self.mixture.generated && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
+        let joint = &self.joint;
+        within("joint.ema", joint.ema, 0.0, 0.999_999)?;
+        within("joint.guidance.dropout", joint.guidance.dropout, 0.0, 0.999)?;
+        within("joint.guidance.weight", joint.guidance.weight, 0.0, 100.0)?;
+        within("joint.guidance.from", joint.guidance.from, 0.0, 1.0)?;
+        // A row is its own nearest neighbour.
+        within("joint.scores.neighbour", joint.scores.neighbour as f64, 2.0, 1e6)?;
+        within("joint.scores.reference", joint.scores.reference as f64, joint.scores.neighbour as f64, 1e12)?;
+        for (key, value) in [
+            ("joint.width", joint.width),
+            ("joint.embedding", joint.embedding),
+            ("joint.batch", joint.batch),
+            ("joint.rows", joint.rows),
+        ] {
+            within(key, value as f64, 1.0, 1e12)?;
+        }
+        joint.process.check().map_err(|e| Error::Usage(format!("joint.process: {e}")))?;
+        joint.sampler.check().map_err(|e| Error::Usage(format!("joint.sampler: {e}")))?;
+        if self.learner.algorithm == Algorithm::Dmc {
+            let MixtureConfig { generated, source, .. } = self.mixture;
+            let scored = matches!(generated, GeneratedRows::None | GeneratedRows::Dmc)
+                && source != SourceRows::Relabelled
+                && (generated, source) != (GeneratedRows::None, SourceRows::None);
+            if !scored {
+                return Err(Error::Usage(format!(
+                    "learner.algorithm = \"dmc\": found mixture.generated = {generated:?} and mixture.source = {source:?}, expected \
+                     rows that have scores; use generated = \"dmc\", or \"none\" with source = \"all\", \"nearest\" or \"transport\""
+                )));
+            }
+        }
+        self.learner.dmc.check().map_err(|e| Error::Usage(format!("learner.dmc: {e}")))?;
+        if self.mixture.generated == GeneratedRows::Tce && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
             return Err(Error::Usage(
                 "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \
-                 a number of rows, a smaller lambda, or mixture.generated = false"
+                 a number of rows, a smaller lambda, or mixture.generated = \"none\""
                     .into(),
             ));
         }

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::{
-    Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
+    Bc, Buffer, Dmc, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
     return_range_scale, train_side_by_side,
 };
 use tce_nn::{Checkpoints, Device, is_cpu};
@@ -141,6 +141,10 @@ fn lane(data: &[MemberData], config: &LearnerConfig, device: &Device) -> Result<
             let regulariser = regulariser.ok_or(Error::Interrupted)?;
             Box::new(Iql::new(&buffer, &config.iql, regulariser, config.steps, device)?)
         }
+        Algorithm::Dmc => {
+            let dmc = Dmc::new(&buffer, &config.dmc, &config.iql, &config.behaviour, config.steps, device)?;
+            Box::new(dmc.ok_or(Error::Interrupted)?)
+        }
     };
     Ok((buffer, learner))
 }
@@ -149,6 +153,7 @@ fn label(algorithm: Algorithm) -> &'static str {
     match algorithm {
         Algorithm::Bc => "bc",
         Algorithm::Iql => "iql",
+        Algorithm::Dmc => "dmc",
     }
 }
 

@@ -9,12 +9,16 @@ use tce_base::{write_atomically, write_json};
 use tce_nn::Device;
 
 use crate::actors::{Arena, Evaluation};
-use crate::config::{Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows};
+use crate::config::{
+    Algorithm, Config, EvaluationConfig, FilterConfig, GeneratedRows, GeneratorConfig, LabelsConfig, MixtureConfig,
+    SourceRows,
+};
 use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
+use crate::joint::source_scores;
 use crate::learning::{Learned, MemberData, Place, learn};
-use crate::mixture::extra_rows;
+use crate::mixture::{Extra, extra_rows};
 use crate::stage::Stage;
 
 /// The outcome of a variant.
@@ -49,6 +53,7 @@ struct RunSpec<'a> {
     generator: Option<&'a GeneratorConfig>,
     filter: Option<&'a FilterConfig>,
     labels: Option<&'a LabelsConfig>,
+    joint: Option<serde_json::Value>,
 }
 
 /// What a run says about its policies: `result.json`.
@@ -62,8 +67,12 @@ struct Outcome<'a> {
 impl Config {
     /// Whether source rows are looked at, in any stage.
     pub fn needs_source(&self) -> bool {
-        self.mixture.source != SourceRows::None
-            || (self.mixture.generated && (self.generator.source_states || self.generator.rows == 0))
+        let generating = match self.mixture.generated {
+            GeneratedRows::None | GeneratedRows::Synther => false,
+            GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0,
+            GeneratedRows::Dmc => true,
+        };
+        generating || self.mixture.source != SourceRows::None || self.learner.algorithm == Algorithm::Dmc
     }
 }
 
@@ -77,7 +86,8 @@ pub fn run(
     place: &str,
     device: &Device,
 ) -> Result<Summary> {
-    let generated = config.mixture.generated;
+    let generated = config.mixture.generated != GeneratedRows::None;
+    let two_stages = config.mixture.generated == GeneratedRows::Tce;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
     let spec = RunSpec {
         inputs: inputs.spec(config.needs_source()),
@@ -85,9 +95,10 @@ pub fn run(
         mixture: &config.mixture,
         learner: config.learner.used(),
         evaluation: &config.evaluation,
-        generator: generated.then_some(&config.generator),
-        filter: generated.then_some(&config.filter),
-        labels: (generated || relabelled).then_some(&config.labels),
+        generator: two_stages.then_some(&config.generator),
+        filter: two_stages.then_some(&config.filter),
+        labels: (two_stages || relabelled).then_some(&config.labels),
+        joint: config.joint.used(config.mixture.generated, config.learner.algorithm),
     };
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec)?;
     if let Some(summary) = stage.summary::<Summary>()? {
@@ -109,23 +120,25 @@ pub fn run(
             files.push(report.file.clone());
         }
         reports = expansion.reports;
-        tables = Some(expansion.tables);
+        let scored = expansion.tables.into_iter().zip(expansion.scores);
+        tables = Some(scored.map(|(rows, scores)| Extra { rows, scores }).collect::<Vec<_>>());
     }
     let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
-    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), seeds, root)?;
+    let scores = source_scores(inputs, config, root)?;
+    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
     drop((tables, models));
 
     let target = Arc::new(inputs.target.rows.clone());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
         // Generated rows among them are no trajectories.
-        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].clone() });
+        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
     }
     let data = |(m, &seed): (usize, &u64)| MemberData {
         seed,
         target: target.clone(),
-        extra: extra.as_ref().map(|e| e[m].clone()),
-        row_scores: None,
+        extra: extra.as_ref().map(|e| e[m].rows.clone()),
+        row_scores: extra.as_ref().and_then(|e| e[m].scores.clone()),
         trajectories: trajectories.clone(),
     };
     let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
@@ -133,7 +146,7 @@ pub fn run(
         (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
     };
-    let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
+    let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
     drop(extra);
     let place = Place { directory: attempt.directory(), key: attempt.key() };
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {

@@ -27,6 +27,12 @@ pub enum Variant {
     TceNoFilter,
     /// TCE(OG) without the behaviour-policy term.
     TceNoReg,
+    /// IQL on target rows and rows of a model of whole target transitions (SynthER).
+    Synther,
+    /// DmC, corrected: source rows and guided generated rows, filtered and weighed by their scores.
+    Dmc,
+    /// DmC as its code runs.
+    DmcPublished,
     /// Behaviour cloning of the target rows, observations as they are.
     BcRaw,
     /// Behaviour cloning of the target rows, observations standardised: the floor.
@@ -56,6 +62,9 @@ impl Variant {
             Variant::IqlSwt => "IQL*(SwT)",
             Variant::TceNoFilter => "TCE(OG) w/o filtering",
             Variant::TceNoReg => "TCE(OG) w/o policy reg.",
+            Variant::Synther => "SynthER",
+            Variant::Dmc => "DmC",
+            Variant::DmcPublished => "DmC, as published",
             Variant::BcRaw => "BC, raw observations",
             Variant::Bc => "BC, standardised",
             Variant::BcTop => "BC, best half",
@@ -64,24 +73,28 @@ impl Variant {
 
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
     pub(crate) fn layer(self, lambda: f64) -> String {
-        let iql = |generated: bool, source: &str, lambda: f64| {
-            format!("mixture = {{ generated = {generated}, source = {source:?}, lambda = {lambda:?} }}\n")
+        let iql = |generated: &str, source: &str, lambda: f64| {
+            format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n")
         };
-        let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql(false, "none", 0.0));
+        let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql("none", "none", 0.0));
         match self {
-            Variant::TceOg => iql(true, "none", 0.0),
-            Variant::TceNn => iql(true, "nearest", lambda),
-            Variant::TceOt => iql(true, "transport", lambda),
+            Variant::TceOg => iql("tce", "none", 0.0),
+            Variant::TceNn => iql("tce", "nearest", lambda),
+            Variant::TceOt => iql("tce", "transport", lambda),
             Variant::SimpleAug => {
-                format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql(true, "none", 0.0))
+                format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql("tce", "none", 0.0))
             }
             Variant::TargetOnly => {
-                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql(false, "none", 0.0))
+                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql("none", "none", 0.0))
             }
-            Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "all", 1.0)),
-            Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "relabelled", 1.0)),
-            Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql(true, "none", 0.0)),
-            Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql(true, "none", 0.0)),
+            Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "all", 1.0)),
+            Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "relabelled", 1.0)),
+            Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql("tce", "none", 0.0)),
+            Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql("tce", "none", 0.0)),
+            Variant::Synther => format!("{}learner.iql.regulariser = \"none\"\n", iql("synther", "none", 0.0)),
+            // As many generated rows as source rows, as DmC generates them.
+            Variant::Dmc => format!("{}learner.algorithm = \"dmc\"\n", iql("dmc", "all", 0.5)),
+            Variant::DmcPublished => format!("{}learner.dmc.mode = \"published\"\n", Variant::Dmc.layer(lambda)),
             Variant::BcRaw => bc("learner.standardise = false\n"),
             Variant::Bc => bc("learner.standardise = true\n"),
             Variant::BcTop => bc("learner.standardise = true\nlearner.top = 0.5\n"),
