@@ -9,12 +9,13 @@
 //! | In which units does a network see it? | [`Standardizer`] |
 //! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
 //! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
-//! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF) |
+//! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
 //!
 //! Everything here is deterministic: the same bytes at any number of threads.
 
 mod agents;
 mod check;
+pub mod density;
 mod error;
 pub mod files;
 mod filter;
@@ -31,6 +32,7 @@ mod transport;
 
 pub use agents::{AgentMismatch, ensure_same_agent, infer_agents};
 pub use check::{Check, Finding, Severity, check};
+pub use density::{DensityOptions, DensityScale, DensityScores, density_scores, further_scores};
 pub use error::{DataError, Problem};
 pub use files::{Dropped, Layout, LoadOptions, LoadReport, Loaded, Successors, load, read_attributes, save_d4rl};
 pub use filter::zscore_keep;

@@ -9,8 +9,8 @@ use std::time::Instant;
 use rand::RngExt;
 use tce_base::Streams;
 use tce_data::{
-    LoadOptions, NeighbourOptions, Rows, Standardizer, TransportOptions, check, inspect, load, nn_distances, save_d4rl,
-    transport_costs, zscore_keep,
+    DensityOptions, LoadOptions, NeighbourOptions, Rows, Standardizer, TransportOptions, check, density_scores,
+    inspect, load, nn_distances, save_d4rl, transport_costs, zscore_keep,
 };
 
 fn seconds<T>(what: &str, work: impl FnOnce() -> T) -> T {
@@ -61,6 +61,15 @@ fn speed_of_neighbours() {
     let (x, y) = (points("source", 1_000_000, 40), points("target", 5_000, 40));
     let options = NeighbourOptions::default();
     seconds("neighbours 1M x 5k x 40", || nn_distances(&Rows::new(&x, 40), &Rows::new(&y, 40), &options).unwrap());
+}
+
+#[test]
+#[ignore = "a timing"]
+fn speed_of_density_scores() {
+    let (x, y) = (points("source", 1_000_000, 40), points("target", 5_000, 40));
+    let (x, y) = (Rows::new(&x, 40), Rows::new(&y, 40));
+    let options = DensityOptions::default();
+    seconds("density scores 1M x 50k x 40", || density_scores(&x, &y, &options, &Streams::new(0)).unwrap());
 }
 
 #[test]

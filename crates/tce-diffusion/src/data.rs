@@ -31,6 +31,7 @@ pub struct ScoreData<'a> {
     dims: usize,
     condition: usize,
     balanced: bool,
+    dropout: f64,
 }
 
 impl<'a> ScoreData<'a> {
@@ -66,7 +67,20 @@ impl<'a> ScoreData<'a> {
             }
             counts.push(n);
         }
-        Ok(Self { parts, counts, dims, condition, balanced })
+        Ok(Self { parts, counts, dims, condition, balanced, dropout: 0.0 })
+    }
+
+    /// The same, and with probability `rate` a drawn row comes under the condition of all zeros: what the network learns for that
+    /// is the distribution without a condition, which classifier-free guidance needs ([`crate::Guided`]). Give conditions that are
+    /// never all zeros, see [`present`].
+    ///
+    /// # Errors
+    /// If `rate` is not in [0, 1).
+    pub fn with_dropout(self, rate: f64) -> Result<Self, DiffusionError> {
+        if !(0.0..1.0).contains(&rate) {
+            return Err(DiffusionError::input("condition dropout", rate, "at least 0 and less than 1"));
+        }
+        Ok(Self { dropout: rate, ..self })
     }
 
     /// A domain-labelled set for the state score network: source rows under label 1, target rows under label 0 (Eq. 5).
@@ -89,6 +103,11 @@ impl<'a> ScoreData<'a> {
     /// Width of the rows.
     pub fn dims(&self) -> usize {
         self.dims
+    }
+
+    /// Probability of a dropped condition.
+    pub(crate) fn dropout(&self) -> f64 {
+        self.dropout
     }
 
     /// Width of the conditions.
@@ -118,6 +137,12 @@ impl<'a> ScoreData<'a> {
     }
 }
 
+/// Conditions of width `width` with a 1 behind each, which tells a condition that is there from none at all (all zeros):
+/// row-major, `width` + 1 columns.
+pub fn present(conditions: &[f32], width: usize) -> Vec<f32> {
+    conditions.chunks_exact(width).flat_map(|c| c.iter().copied().chain([1.0])).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -134,6 +159,14 @@ mod tests {
         };
         assert_eq!(share(true), 0.5);
         assert!((share(false) - 0.1).abs() < 0.01);
+    }
+
+    #[test]
+    fn a_condition_that_is_there_differs_from_none() {
+        assert_eq!(present(&[0.0, 2.0, 0.0, 0.0], 2), [0.0, 2.0, 1.0, 0.0, 0.0, 1.0]);
+        let data = ScoreData::labelled(&[1.0], &[0.0], 1, true).unwrap();
+        let error = data.with_dropout(1.0).unwrap_err().to_string();
+        assert_eq!(error, "condition dropout: found 1, expected at least 0 and less than 1");
     }
 
     #[test]

@@ -17,11 +17,11 @@ mod sampler;
 mod target;
 mod train;
 
-pub use data::{Condition, Part, ScoreData};
+pub use data::{Condition, Part, ScoreData, present};
 pub use error::DiffusionError;
 pub use model::{Chunks, Request, ScoreModel, uniform_labels};
 pub use network::{BoundNetwork, NetworkConfig, ScoreNetwork};
 pub use process::{Edm, Grid, Increment, Level, Precondition, Process, Start, Ve, Vp};
-pub use sampler::{Denoiser, Sampler};
+pub use sampler::{Denoiser, Guided, Sampler};
 pub use target::Target;
 pub use train::{Schedule, TrainConfig, Trainer};

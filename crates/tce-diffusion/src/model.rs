@@ -9,7 +9,7 @@ use tce_base::random::{fill_normal, fill_uniform};
 use tce_base::{FileError, Progress, Sealed, Streams, read_sealed, write_sealed};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
 
-use crate::{BoundNetwork, Denoiser, DiffusionError, Level, NetworkConfig, Process, Sampler, ScoreNetwork};
+use crate::{BoundNetwork, Denoiser, DiffusionError, Guided, Level, NetworkConfig, Process, Sampler, ScoreNetwork};
 
 /// Rows sampled together. Part of the definition of the result: each chunk has its own noise stream, and the Langevin
 /// step size is an average over the chunk.
@@ -43,10 +43,20 @@ pub struct Request<'a> {
     pub rows: usize,
     /// Conditions `[P, rows, c]`, or `[rows, c]` for all members.
     pub condition: &'a [f32],
+    /// w of classifier-free guidance ([`Guided`]) against the condition of all zeros, which costs a second evaluation; None: the
+    /// conditional model as it is. For models trained with [`crate::ScoreData::with_dropout`].
+    pub guidance: Option<f64>,
     /// Training rows `[P, rows, d]` or `[rows, d]` to start from; needed where [`Process::starts_at_data`] only.
     pub start: Option<&'a [f32]>,
     /// Where finished chunks are kept and taken from, so that an interrupted sampling goes on.
     pub kept: Option<Chunks<'a>>,
+}
+
+impl Request<'_> {
+    /// Network evaluations per row.
+    pub fn evaluations(&self, sampler: &Sampler) -> usize {
+        sampler.evaluations() * if self.guidance.is_some() { 2 } else { 1 }
+    }
 }
 
 /// Sampled chunks on disk: one file of checksummed f32 for each member and 4096 rows.
@@ -118,7 +128,7 @@ impl ScoreModel {
     }
 
     /// Samples rows `[P, rows, d]`, row-major; member i draws from `streams[i]` (`sample/{name}`, one index per chunk of
-    /// 4096 rows), so that the bytes do not depend on the number of threads. `progress` counts rows × evaluations.
+    /// 4096 rows), so that the bytes do not depend on the number of threads. `progress` counts rows × evaluations of the sampler.
     ///
     /// # Errors
     /// If the request does not fit the model or a sampler setting is unusable; if the user interrupts.
@@ -146,6 +156,9 @@ impl ScoreModel {
             ))
         };
         fits("condition", request.condition, c)?;
+        if let Some(w) = request.guidance.filter(|w| !w.is_finite()) {
+            return Err(DiffusionError::input(format!("guidance of '{}'", request.name), w, "a finite number"));
+        }
         let start = request.start.filter(|_| self.process.starts_at_data());
         match start {
             Some(start) => fits("start", start, d)?,
@@ -183,7 +196,7 @@ impl ScoreModel {
             let condition = part(request.condition, c);
             let start = start.map(|s| part(s, d));
             let rng = streams[m].indexed(&format!("sample/{}", request.name), k as u64);
-            let rows = networks[m].sample_chunk(condition, start, n, sampler, rng, progress)?;
+            let rows = networks[m].sample_chunk(condition, request.guidance, start, n, sampler, rng, progress)?;
             chunk.copy_from_slice(&rows);
             match &request.kept {
                 Some(kept) => Ok(kept.save(request.name, m, k, &rows).map_err(NetworkError::from)?),
@@ -194,9 +207,11 @@ impl ScoreModel {
     }
 
     /// Samples `n` rows of a population of one.
+    #[allow(clippy::too_many_arguments)]
     fn sample_chunk(
         &self,
         condition: Vec<f32>,
+        guidance: Option<f64>,
         start: Option<Vec<f32>>,
         n: usize,
         sampler: &Sampler,
@@ -210,14 +225,25 @@ impl ScoreModel {
             fill_normal(&mut rng, &mut z);
             tensor(z, [1, n, d], &device)
         };
-        let condition = tensor(condition, [1, n, self.config.condition], &device);
-        let denoiser = Bound { network: self.network.bind(condition), process: self.process, progress };
+        let width = self.config.condition;
+        let bound = |condition: Vec<f32>, progress| {
+            let network = self.network.bind(tensor(condition, [1, n, width], &device));
+            Bound { network, process: self.process, progress }
+        };
+        let with = bound(condition, progress);
         let noise = normal() * self.process.start_std();
         let x = match start {
             Some(rows) => noise + tensor(rows, [1, n, d], &device) * self.process.level(1.0).alpha,
             None => noise,
         };
-        Ok(host(sampler.run(&self.process, &denoiser, x, &mut normal)?))
+        let rows = match guidance {
+            None => sampler.run(&self.process, &with, x, &mut normal)?,
+            Some(weight) => {
+                let guided = Guided { with, without: bound(vec![0.0; n * width], None), weight };
+                sampler.run(&self.process, &guided, x, &mut normal)?
+            }
+        };
+        Ok(host(rows))
     }
 
     /// The parameters, with the specification in the metadata.

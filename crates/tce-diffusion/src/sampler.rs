@@ -23,6 +23,27 @@ pub trait Denoiser {
     fn denoise(&self, x: Tensor<3>, level: Level) -> Tensor<3>;
 }
 
+/// Classifier-free guidance (Ho & Salimans 2022): D = D_without + w (D_with − D_without).
+///
+/// w = 0 leaves the condition out, 1 is the plain conditional model, more exaggerates the condition. The score is linear in D, so
+/// that the same holds for scores.
+pub struct Guided<A, B> {
+    /// Under the condition.
+    pub with: A,
+    /// Under none.
+    pub without: B,
+    /// w
+    pub weight: f64,
+}
+
+impl<A: Denoiser, B: Denoiser> Denoiser for Guided<A, B> {
+    fn denoise(&self, x: Tensor<3>, level: Level) -> Tensor<3> {
+        let without = self.without.denoise(x.clone(), level);
+        let with = self.with.denoise(x, level);
+        without.clone() + (with - without) * self.weight
+    }
+}
+
 /// Which sampler.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]

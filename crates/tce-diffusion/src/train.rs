@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
 use tce_base::{Progress, Streams, interrupted};
@@ -250,7 +251,12 @@ impl Trainer {
                 let (of_row, of_noise) = (of_row as f32, of_noise as f32);
                 target.extend(row.iter().zip(&z).map(|(x, z)| of_row * x + of_noise * z));
                 time.push(pre.time as f32);
-                condition.extend_from_slice(on);
+                // Drawn last, and only where wanted: other trainings keep their numbers.
+                if data.dropout() > 0.0 && rng.random::<f64>() < data.dropout() {
+                    condition.resize(condition.len() + c, 0.0);
+                } else {
+                    condition.extend_from_slice(on);
+                }
             }
         }
         let tensor = |data, width| tensor(data, [p, b, width], &self.device);

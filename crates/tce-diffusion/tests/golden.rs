@@ -2,7 +2,7 @@
 
 use tce_base::random::fill_normal;
 use tce_base::{Rng, Streams};
-use tce_diffusion::{Denoiser, Edm, Grid, Level, Process, Sampler, Start, Ve, Vp};
+use tce_diffusion::{Denoiser, Edm, Grid, Guided, Level, Process, Sampler, Start, Ve, Vp};
 use tce_nn::burn::tensor::activation::sigmoid;
 use tce_nn::{Tensor, cpu, host, tensor};
 
@@ -191,4 +191,48 @@ fn four_times_the_steps_shrink_the_error_by_far() {
             assert!(coarse < 0.12 && fine < coarse / 2.0 && fine < 0.025, "{process:?}: {coarse} {fine}");
         }
     }
+}
+
+/// Two Gaussians of one width: (1 − w) and w parts of their linear denoisers are the denoiser of a Gaussian of that width around
+/// m₀ + w (m₁ − m₀), so that guidance has a closed form at every level and at the end of every sampler.
+#[test]
+fn guidance_moves_a_gaussian_as_far_as_its_weight_says() {
+    let without = || Gaussian { mean: [-0.4, 0.0, 0.3], ..GAUSSIAN };
+    let mean = |w: f64| [0, 1, 2].map(|d| (1.0 - w) as f32 * without().mean[d] + w as f32 * GAUSSIAN.mean[d]);
+    for w in [0.0, 1.0, 1.2, 3.0] {
+        let guided = Guided { with: GAUSSIAN, without: without(), weight: w };
+        let exact = Gaussian { mean: mean(w), ..GAUSSIAN };
+        for process in [vp(), edm()] {
+            for tau in [0.1, 0.5, 1.0] {
+                let x = normal(&mut Streams::new(2).stream("x"), 3);
+                let (a, b) = (guided.denoise(x.clone(), process.level(tau)), exact.denoise(x, process.level(tau)));
+                assert!(host(a).iter().zip(host(b)).all(|(a, b)| (a - b).abs() < 1e-5), "{w} {process:?} {tau}");
+            }
+        }
+        let columns = sample(&edm(), Sampler::SdeDpmSolver { steps: 40 }, &guided, 3, |z| z);
+        for (d, column) in columns.iter().enumerate() {
+            let ((m, s), std) = (moments(column), GAUSSIAN.std[d] as f64);
+            assert!((m - mean(w)[d] as f64).abs() < 0.03 * std, "{w} {d}: {m}");
+            assert!((s / std - 1.0).abs() < 0.04, "{w} {d}: {s}");
+        }
+    }
+}
+
+/// A condition that says which mode: more than weight 1 does not leave the mode, and weight 0 gives both.
+#[test]
+fn guidance_of_a_mixture_keeps_to_the_mode() {
+    struct Mode;
+    impl Denoiser for Mode {
+        fn denoise(&self, x: Tensor<3>, Level { alpha, sigma, .. }: Level) -> Tensor<3> {
+            let gain = alpha * MODE_STD * MODE_STD / ((alpha * MODE_STD).powi(2) + sigma * sigma);
+            (x - MODES[1] * alpha) * gain + MODES[1]
+        }
+    }
+    let right = |weight| {
+        let guided = Guided { with: Mode, without: Mixture, weight };
+        let x = sample(&edm(), Sampler::DpmSolver { steps: 40 }, &guided, 1, |z| z).remove(0);
+        x.iter().filter(|x| **x > -0.2).count() as f64 / ROWS as f64
+    };
+    assert!((right(0.0) - (1.0 - LEFT)).abs() < 0.012);
+    assert!(right(1.0) > 0.999 && right(1.2) > 0.999);
 }

@@ -6,7 +6,7 @@ use tce_base::Streams;
 use tce_base::random::fill_normal;
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{
-    Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, Start, TrainConfig, Trainer, Ve, Vp,
+    Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, Start, TrainConfig, Trainer, Ve, Vp, present,
     uniform_labels,
 };
 use tce_nn::{Checkpoints, cpu};
@@ -42,7 +42,8 @@ fn the_label_moves_samples_between_the_domains() {
         let model = train(process, small(1, 1), &data, 1, 1500, 2e-3);
         let distances = [0.0, 0.5, 1.0].map(|y| {
             let n = 2000;
-            let request = Request { name: "x", rows: n, condition: &vec![y; n], start: None, kept: None };
+            let request =
+                Request { name: "x", rows: n, condition: &vec![y; n], guidance: None, start: None, kept: None };
             let x = model.sample(request, &sampler, &[Streams::new(5)], None).unwrap();
             [&source, &target].map(|rows| sliced_wasserstein(&x, rows, 1, 1, &Streams::new(0)))
         });
@@ -62,10 +63,40 @@ fn samples_follow_their_condition() {
     let data = ScoreData::conditioned(&rows, 1, &c, 1).unwrap();
     let model = train(Process::Ve(Ve { start: Start::Data, ..Ve::default() }), small(1, 1), &data, 1, 1500, 2e-3);
     let on = normal("new", 3000, 0.0, 1.0);
-    let request = Request { name: "x", rows: 3000, condition: &on, start: Some(&rows), kept: None };
+    let request = Request { name: "x", rows: 3000, condition: &on, guidance: None, start: Some(&rows), kept: None };
     let x = model.sample(request, &Sampler::Heun { steps: 18 }, &[Streams::new(5)], None).unwrap();
     let error = (x.iter().zip(&on).map(|(x, c)| (x - c).powi(2)).sum::<f32>() / 3000.0).sqrt();
     assert!(error > 0.05 && error < 0.25, "{error}");
+}
+
+/// One network learns p(x | score) and p(x): score 1 is around 1, score 0 around −1, and half of the rows have either.
+#[test]
+fn a_dropped_condition_is_the_whole_distribution_and_guidance_sharpens() {
+    let (high, low) = (normal("high", 1000, 1.0, 0.2), normal("low", 1000, -1.0, 0.2));
+    let rows = [high, low].concat();
+    let on = present(&[vec![1.0; 1000], vec![0.0; 1000]].concat(), 1);
+    let data = ScoreData::conditioned(&rows, 1, &on, 2).unwrap().with_dropout(0.25).unwrap();
+    let model = train(Process::Edm(Edm::default()), small(1, 2), &data, 1, 1500, 2e-3);
+    let n = 2000;
+    let sample = |score: f32, guidance: Option<f64>| {
+        let condition = present(&vec![score; n], 1);
+        let request = Request { name: "x", rows: n, condition: &condition, guidance, start: None, kept: None };
+        assert_eq!(request.evaluations(&Sampler::Heun { steps: 3 }), if guidance.is_some() { 10 } else { 5 });
+        model.sample(request, &Sampler::DpmSolver { steps: 20 }, &[Streams::new(5)], None).unwrap()
+    };
+    let high = |x: &[f32]| x.iter().filter(|x| **x > 0.0).count() as f64 / n as f64;
+    assert!(high(&sample(1.0, None)) > 0.97 && high(&sample(0.0, None)) < 0.03);
+    let without = high(&sample(1.0, Some(0.0)));
+    assert!((without - 0.5).abs() < 0.1, "{without}");
+    // Between the two the guided samples go further to the side of their condition than the plain ones.
+    let (plain, guided) = (high(&sample(0.7, None)), high(&sample(0.7, Some(2.0))));
+    assert!(guided >= plain, "{guided} {plain}");
+    let same = sample(1.0, Some(1.0)).iter().zip(sample(1.0, None)).all(|(a, b)| (a - b).abs() < 1e-3);
+    assert!(same, "weight 1 is no guidance");
+    let request =
+        Request { name: "x", rows: 1, condition: &[0.0; 2], guidance: Some(f64::NAN), start: None, kept: None };
+    let error = model.sample(request, &Sampler::DpmSolver { steps: 5 }, &[Streams::new(5)], None).unwrap_err();
+    assert_eq!(error.to_string(), "guidance of 'x': found NaN, expected a finite number");
 }
 
 fn population() -> (ScoreModel, [Streams; 2]) {
@@ -81,7 +112,7 @@ fn bytes_do_not_depend_on_the_threads_nor_on_the_population() {
     let labels: Vec<f32> = (0..2).flat_map(|m| uniform_labels(&Streams::new(m), "y", n, 0.2)).collect();
     assert!(labels.iter().all(|y| (0.0..0.2).contains(y)));
     let sampler = Sampler::PredictorCorrector { steps: 5, snr: 0.16, corrections: 1 };
-    let request = Request { name: "state", rows: n, condition: &labels, start: None, kept: None };
+    let request = Request { name: "state", rows: n, condition: &labels, guidance: None, start: None, kept: None };
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -121,7 +152,7 @@ fn files_keep_the_model() {
 #[test]
 fn requests_that_do_not_fit_are_refused() {
     let (model, streams) = population();
-    let request = Request { name: "x", rows: 3, condition: &[0.0; 3], start: None, kept: None };
+    let request = Request { name: "x", rows: 3, condition: &[0.0; 3], guidance: None, start: None, kept: None };
     let error = |request, sampler: Sampler, streams: &[Streams]| {
         model.sample(request, &sampler, streams, None).unwrap_err().to_string()
     };

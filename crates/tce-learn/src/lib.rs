@@ -11,6 +11,7 @@
 //! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
 //! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`] |
 //! | choosing among a batch's rows | [`selection`] |
+//! | DmC: scored rows, filtered and weighed | [`dmc`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
 
@@ -23,6 +24,7 @@ pub mod critic;
 pub mod cvae;
 pub mod dara;
 pub mod deterministic;
+pub mod dmc;
 mod error;
 pub mod igdf;
 pub mod import;
@@ -47,6 +49,7 @@ pub use blocks::map_rows;
 pub use bosa::{Bosa, BosaConfig};
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};
 pub use dara::{Dara, DaraConfig};
+pub use dmc::{Dmc, DmcConfig};
 pub use error::LearnError;
 pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use rand::RngExt;
 use tce_base::Streams;
 use tce_data::{Standardizer, Transitions};
+use tce_learn::dmc::{Dmc, DmcConfig};
 use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Place, Policy, PolicyLearner, Steps,
-    best_trajectories, train, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Mode, Place, Policy, PolicyLearner,
+    Steps, best_trajectories, train, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -223,4 +224,99 @@ fn regularisers_pull_the_policy_to_the_target_behaviour() {
         let a = actions(kind, beta_reg);
         assert!(a.iter().all(|a| *a > 0.45), "{kind:?}: {a:?}");
     }
+}
+
+/// Two corridors, of which in the second the rows that go right are called target-like.
+fn scored_member(seed: u64) -> Member {
+    let target = corridor();
+    let others = corridor();
+    let scores = others.actions.iter().map(|a| if *a > 0.0 { 0.9 } else { 0.2 }).collect();
+    Member { parts: vec![target.clone(), others], row_scores: Some(Arc::new(scores)), ..member(seed, &target, true) }
+}
+
+fn small_behaviour() -> RegulariserConfig {
+    let mut behaviour = RegulariserConfig { samples: 3, ..RegulariserConfig::default() };
+    (behaviour.cvae.hidden, behaviour.cvae.steps) = (vec![32], 300);
+    behaviour
+}
+
+fn new_dmc(buffer: &Buffer, config: &DmcConfig, steps: u64) -> Result<Dmc, LearnError> {
+    let behaviour = config.behaviour(&small_behaviour());
+    let kind = RegulariserKind::Otdf;
+    let regulariser = Regulariser::prepare(kind, buffer, &behaviour, Place::NONE, &cpu()).unwrap().unwrap();
+    Dmc::new(buffer, config, &corridor_config(), regulariser, steps, &cpu())
+}
+
+/// Everything of one update against the same of IQL on the rows and weights that the definition names.
+#[test]
+fn dmc_is_iql_on_the_kept_rows_with_their_weights() {
+    use tce_learn::Meter;
+    use tce_nn::tensor;
+    let buffer = Buffer::new(vec![scored_member(1), scored_member(2)], 32).unwrap();
+    let behaviour = small_behaviour();
+    let (config, base) = (DmcConfig::default(), corridor_config());
+    let mut dmc = new_dmc(&buffer, &config, 5).unwrap();
+    let regulariser = Regulariser::prepare(RegulariserKind::Otdf, &buffer, &behaviour, Place::NONE, &cpu());
+    let regulariser = regulariser.unwrap().unwrap();
+    let mut iql = Iql::new(&buffer, &config.backbone(&base), regulariser, 5, &cpu()).unwrap();
+    for step in 0..5 {
+        let batch = buffer.sample(step, &cpu());
+        let (mut rows, mut weights) = (Vec::new(), Vec::new());
+        for (member, picks) in buffer.members().iter().zip(batch.picks.chunks(32)) {
+            let score = |i: usize| member.row_scores.as_ref().unwrap()[picks[i].row as usize];
+            let mut others: Vec<usize> = (16..32).collect();
+            others.sort_by(|&a, &b| score(b).partial_cmp(&score(a)).unwrap());
+            let mut kept: Vec<usize> = (0..16).chain(others[..8].iter().copied()).collect();
+            kept.sort_unstable();
+            weights.extend(kept.iter().map(|&i| if i < 16 { 1.0 } else { score(i) }));
+            rows.push(kept);
+        }
+        iql.step(&batch.keep(&rows), Some(tensor(weights, [2, 24, 1], &cpu())), step, &mut Meter::default());
+        dmc.update(&batch, step, &mut Meter::default());
+    }
+    assert_eq!(dmc.state(), iql.state());
+}
+
+#[test]
+fn dmc_goes_on_from_its_state_and_refuses_rows_without_scores() {
+    let buffer = Buffer::new(vec![scored_member(1)], 32).unwrap();
+    let new = || new_dmc(&buffer, &DmcConfig::default(), 20).unwrap();
+    let go = |dmc: &mut Dmc, from, to| {
+        let steps = Steps { from, to, report_every: 0 };
+        train(dmc, &buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |_, _| Ok::<_, LearnError>(())).unwrap();
+    };
+    let mut whole = new();
+    go(&mut whole, 0, 20);
+    let mut first = new();
+    go(&mut first, 0, 11);
+    let mut second = new();
+    second.restore(&first.state(), Path::new("state")).unwrap();
+    go(&mut second, 11, 20);
+    assert_eq!(whole.state(), second.state());
+
+    let error = |member: Member| {
+        let buffer = Buffer::new(vec![member], 32).unwrap();
+        new_dmc(&buffer, &DmcConfig::default(), 20).err().unwrap().to_string()
+    };
+    assert!(error(Member { row_scores: None, ..scored_member(1) }).contains("member 0, row_scores"));
+    assert!(error(member(1, &corridor(), true)).contains("DmC compares the two"));
+    let rows = scored_member(1).parts[1].len();
+    let bad = Member { row_scores: Some(Arc::new(vec![f32::NAN; rows])), ..scored_member(1) };
+    assert!(error(bad).contains("a finite number for each"));
+}
+
+/// The good action is +1, the behaviour's mean 0: corrected finds it, published clones whatever the filter leaves (two thirds of
+/// the kept rows go right), as its weights do not tell rows apart.
+#[test]
+fn dmc_learns_and_its_modes_differ() {
+    let buffer = Buffer::new(vec![scored_member(1)], 64).unwrap();
+    let learn = |mode| {
+        let config = DmcConfig { mode, beta_reg: 0.01, ..DmcConfig::default() };
+        let mut dmc = new_dmc(&buffer, &config, 1200).unwrap();
+        run(&mut dmc, &buffer, 1200);
+        action(&dmc.policies()[0], &[0.0])[0]
+    };
+    let (corrected, published) = (learn(Mode::Corrected), learn(Mode::Published));
+    assert!(corrected > 0.55, "{corrected}");
+    assert!(published > 0.05 && published < 0.5, "{published}");
 }

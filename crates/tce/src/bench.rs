@@ -65,6 +65,7 @@ const WORKLOADS: &[Workload] = &[
     ("srpo", "SRPO", || method(Algorithm::Srpo)),
     ("igdf", "IGDF", || method(Algorithm::Igdf)),
     ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", || method(Algorithm::Otdf)),
+    ("dmc", "DmC's learner", || method(Algorithm::Dmc)),
     ("td3-bc", "TD3+BC", || method(Algorithm::Td3Bc)),
     ("rebrac", "ReBRAC", || method(Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
@@ -340,7 +341,7 @@ fn sample() -> Body {
     let labels = uniform_labels(&Streams::new(0), "y", rows, 0.2);
     let flops = 2.0 * score_products(&spec).1 * sampler.evaluations() as f64;
     Body::new("rows", rows as f64, flops, move || {
-        let request = Request { name: "bench", rows, condition: &labels, start: None, kept: None };
+        let request = Request { name: "bench", rows, condition: &labels, guidance: None, start: None, kept: None };
         drop(model.sample(request, &sampler, &[Streams::new(0)], None).expect("a good request"));
     })
 }

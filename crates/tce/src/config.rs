@@ -2,11 +2,11 @@
 //! value comes from is told by [`crate::layers`].
 
 use serde::{Deserialize, Serialize};
-use tce_data::ScoreTable;
+use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, Mode, OtdfConfig, RebracConfig,
-    RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, Mode, OtdfConfig,
+    RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -21,6 +21,7 @@ pub struct Config {
     pub generator: GeneratorConfig,
     pub filter: FilterConfig,
     pub labels: LabelsConfig,
+    pub joint: JointConfig,
     pub mixture: MixtureConfig,
     pub learner: LearnerConfig,
     pub evaluation: EvaluationConfig,
@@ -84,6 +85,71 @@ pub enum Terminal {
     Learned,
 }
 
+/// The network over whole transitions, for `mixture.generated` = synther and dmc, and how it is sampled.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct JointConfig {
+    pub process: Process,
+    pub sampler: Sampler,
+    pub target: Target,
+    pub width: usize,
+    pub embedding: usize,
+    pub blocks: usize,
+    pub steps: u64,
+    pub batch: usize,
+    pub learning_rate: f64,
+    pub schedule: Schedule,
+    pub ema: f64,
+    pub rows: usize,
+    pub guidance: GuidanceConfig,
+    pub scores: DensityOptions,
+}
+
+impl JointConfig {
+    /// The keys that decide generated rows of this kind, or the scores of source rows alone: what a run's identity depends on.
+    /// None where no key does.
+    pub fn used(&self, generated: GeneratedRows, algorithm: Algorithm) -> Option<serde_json::Value> {
+        let mut used = serde_json::json!(self);
+        match (generated, algorithm) {
+            (GeneratedRows::Dmc, _) => {}
+            (GeneratedRows::Synther, _) => {
+                let keys = used.as_object_mut().expect("a table");
+                keys.remove("guidance");
+                keys.remove("scores");
+            }
+            (_, Algorithm::Dmc) => used = serde_json::json!({ "scores": self.scores }),
+            _ => return None,
+        }
+        Some(used)
+    }
+}
+
+/// How scores guide DmC's generator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct GuidanceConfig {
+    pub dropout: f64,
+    pub weight: f64,
+    pub from: f64,
+    pub rescore: bool,
+}
+
+/// Which generated rows join the target rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GeneratedRows {
+    /// None.
+    None,
+    /// TCE's: states, successors, filter, labels (`generator`, `filter`, `labels`).
+    Tce,
+    /// Whole transitions like the target's (`joint`).
+    Synther,
+    /// Whole transitions like the most target-like ones of source and target (`joint`).
+    Dmc,
+}
+
 /// Which source rows join the target rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -105,7 +171,7 @@ pub enum SourceRows {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct MixtureConfig {
-    pub generated: bool,
+    pub generated: GeneratedRows,
     pub source: SourceRows,
     pub lambda: f64,
 }
@@ -132,6 +198,8 @@ pub enum Algorithm {
     Otdf,
     /// BOSA.
     Bosa,
+    /// DmC's: implicit Q-learning on filtered rows, weighed by their scores.
+    Dmc,
 }
 
 /// The learner; the keys of algorithms that are not trained are not looked at.
@@ -153,6 +221,7 @@ pub struct LearnerConfig {
     pub igdf: IgdfConfig,
     pub otdf: OtdfConfig,
     pub bosa: BosaConfig,
+    pub dmc: DmcConfig,
     pub behaviour: RegulariserConfig,
 }
 
@@ -162,7 +231,16 @@ impl LearnerConfig {
         match self.algorithm {
             Algorithm::Iql | Algorithm::Dara | Algorithm::Srpo | Algorithm::Igdf => Some(self.iql.clone()),
             Algorithm::Otdf => Some(self.otdf.backbone(&self.iql)),
+            Algorithm::Dmc => Some(self.dmc.backbone(&self.iql)),
             Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa => None,
+        }
+    }
+
+    /// The behaviour model of the regulariser; as DmC publishes it, one that is not trained.
+    pub fn behaviour(&self) -> RegulariserConfig {
+        match self.algorithm {
+            Algorithm::Dmc => self.dmc.behaviour(&self.behaviour),
+            _ => self.behaviour.clone(),
         }
     }
 
@@ -179,6 +257,7 @@ impl LearnerConfig {
             Algorithm::Igdf => ("igdf", json!(self.igdf)),
             Algorithm::Otdf => ("otdf", json!(self.otdf)),
             Algorithm::Bosa => ("bosa", json!(self.bosa)),
+            Algorithm::Dmc => ("dmc", json!(self.dmc)),
         }
     }
 
@@ -200,7 +279,7 @@ impl LearnerConfig {
         }
         if let Some(iql) = self.backbone() {
             if iql.regulariser != RegulariserKind::None {
-                used["behaviour"] = serde_json::json!(self.behaviour);
+                used["behaviour"] = serde_json::json!(self.behaviour());
             }
             used["iql"] = serde_json::json!(iql);
         }
@@ -208,7 +287,7 @@ impl LearnerConfig {
     }
 
     fn check(&self) -> Result<()> {
-        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, .. } = self;
+        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, dmc, .. } = self;
         let iql = self.backbone().unwrap_or_else(|| iql.clone());
         let checks = [
             ("iql", iql.check()),
@@ -219,6 +298,7 @@ impl LearnerConfig {
             ("igdf", igdf.check()),
             ("otdf", otdf.check()),
             ("bosa", bosa.check()),
+            ("dmc", dmc.check()),
         ];
         let named = |(name, check): (&str, std::result::Result<(), LearnError>)| {
             check.map_err(|e| Error::Usage(format!("learner.{name}: {e}")))
@@ -258,10 +338,41 @@ impl Config {
         ] {
             within(key, value as f64, 1.0, 1e12)?;
         }
-        if self.mixture.generated && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
+        let joint = &self.joint;
+        within("joint.ema", joint.ema, 0.0, 0.999_999)?;
+        within("joint.guidance.dropout", joint.guidance.dropout, 0.0, 0.999)?;
+        within("joint.guidance.weight", joint.guidance.weight, 0.0, 100.0)?;
+        within("joint.guidance.from", joint.guidance.from, 0.0, 1.0)?;
+        // A row is its own nearest neighbour.
+        within("joint.scores.neighbour", joint.scores.neighbour as f64, 2.0, 1e6)?;
+        within("joint.scores.reference", joint.scores.reference as f64, joint.scores.neighbour as f64, 1e12)?;
+        for (key, value) in [
+            ("joint.width", joint.width),
+            ("joint.embedding", joint.embedding),
+            ("joint.batch", joint.batch),
+            ("joint.rows", joint.rows),
+        ] {
+            within(key, value as f64, 1.0, 1e12)?;
+        }
+        joint.process.check().map_err(|e| Error::Usage(format!("joint.process: {e}")))?;
+        joint.sampler.check().map_err(|e| Error::Usage(format!("joint.sampler: {e}")))?;
+        if self.learner.algorithm == Algorithm::Dmc {
+            let MixtureConfig { generated, source, .. } = self.mixture;
+            let scored = matches!(generated, GeneratedRows::None | GeneratedRows::Dmc)
+                && source != SourceRows::Relabelled
+                && (generated, source) != (GeneratedRows::None, SourceRows::None);
+            if !scored {
+                return Err(Error::Usage(format!(
+                    "learner.algorithm = \"dmc\": found mixture.generated = {generated:?} and mixture.source = {source:?}, expected \
+                     rows that have scores; use generated = \"dmc\", or \"none\" with source = \"all\", \"nearest\" or \"transport\""
+                )));
+            }
+        }
+        self.learner.dmc.check().map_err(|e| Error::Usage(format!("learner.dmc: {e}")))?;
+        if self.mixture.generated == GeneratedRows::Tce && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
             return Err(Error::Usage(
                 "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \
-                 a number of rows, a smaller lambda, or mixture.generated = false"
+                 a number of rows, a smaller lambda, or mixture.generated = \"none\""
                     .into(),
             ));
         }

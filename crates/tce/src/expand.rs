@@ -13,10 +13,11 @@ use tce_learn::{LabelConfig, LabelErrors, LabelModels, Labelled, Learner, Member
 use tce_nn::{Device, NamedParameters};
 use tce_sim::terminal_rule;
 
-use crate::config::{Config, FilterConfig, LabelsConfig, Terminal};
+use crate::config::{Config, FilterConfig, GeneratedRows, LabelsConfig, Terminal};
 use crate::error::{Error, Result};
 use crate::generator::Generator;
 use crate::inputs::{InputSpec, Inputs};
+use crate::joint;
 use crate::stage::Stage;
 use crate::units::Units;
 
@@ -156,14 +157,28 @@ fn choose(rows: &[f32], d: usize, keep: &[bool]) -> Vec<f32> {
 pub struct Expansion {
     /// The tables.
     pub tables: Vec<Arc<Transitions>>,
+    /// A score per row, where the rows have any ([`crate::joint`]).
+    pub scores: Vec<Option<Arc<Vec<f32>>>>,
     /// What was noticed.
     pub reports: Vec<Generated>,
     /// The stage with the files.
     pub stage: Stage,
 }
 
-/// Runs, or takes from its stage, the whole expansion.
+/// The generated rows that `config.mixture` asks for, made or taken from their stage.
 pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
+    match config.mixture.generated {
+        GeneratedRows::Tce => two_stages(inputs, config, seeds, root, device),
+        GeneratedRows::Synther | GeneratedRows::Dmc => joint::expand(inputs, config, seeds, root, device),
+        GeneratedRows::None => Err(Error::Usage(
+            "mixture.generated: found \"none\", expected \"tce\", \"synther\" or \"dmc\": there is nothing to generate"
+                .into(),
+        )),
+    }
+}
+
+/// Runs, or takes from its stage, TCE's whole expansion.
+fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
     #[derive(Serialize)]
     struct Spec<'a> {
         networks: String,
@@ -233,5 +248,6 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
             (reports, tables)
         }
     };
-    Ok(Expansion { tables, reports, stage })
+    let scores = vec![None; tables.len()];
+    Ok(Expansion { tables, scores, reports, stage })
 }

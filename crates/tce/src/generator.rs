@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams};
 use tce_data::Transitions;
 use tce_diffusion::{
-    Chunks, Condition, DiffusionError, NetworkConfig, Part, Request, Sampler, Schedule, ScoreData, ScoreModel, Target,
-    TrainConfig, Trainer, uniform_labels,
+    Chunks, Condition, DiffusionError, NetworkConfig, Part, Process, Request, Sampler, Schedule, ScoreData, ScoreModel,
+    Target, TrainConfig, Trainer, uniform_labels,
 };
 use tce_nn::{Checkpoints, Device};
 
@@ -50,7 +50,7 @@ pub struct Trained {
 struct TrainingSpec<'a> {
     inputs: crate::inputs::InputSpec,
     seeds: &'a [u64],
-    process: tce_diffusion::Process,
+    process: Process,
     target: Target,
     state_steps: u64,
     transition_steps: u64,
@@ -181,9 +181,12 @@ impl Generator {
         kept: Option<Chunks>,
     ) -> Result<Vec<f32>> {
         let labels: Vec<f32> = members.iter().flat_map(|m| uniform_labels(m, "state", rows, y_max)).collect();
-        let start = self.start_rows(|| self.units.states(&target.observations), rows, members, "state");
+        let d = self.units.live.len();
+        let training = || self.units.states(&target.observations);
+        let start = start_rows(self.state.process(), training, d, rows, members, "state");
         let progress = progress("sample states", rows * members.len(), sampler);
-        let request = Request { name: "state", rows, condition: &labels, start: start.as_deref(), kept };
+        let request =
+            Request { name: "state", rows, condition: &labels, guidance: None, start: start.as_deref(), kept };
         let mut states = self.state.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.state.invert_in_place(&mut states);
@@ -206,40 +209,15 @@ impl Generator {
             let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
             self.units.output.apply(&self.units.target.encode(&s, &s2))
         };
-        let start = self.start_rows(outputs, rows, members, "successor");
+        let start = start_rows(self.transition.process(), outputs, d, rows, members, "successor");
         let progress = progress("sample successors", rows * members.len(), sampler);
-        let request = Request { name: "successor", rows, condition: &condition, start: start.as_deref(), kept };
+        let request =
+            Request { name: "successor", rows, condition: &condition, guidance: None, start: start.as_deref(), kept };
         let mut out = self.transition.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.output.invert_in_place(&mut out);
         self.units.target.decode(states, &mut out);
         Ok(out)
-    }
-
-    /// Training rows for processes that start at data; the others need none.
-    fn start_rows(
-        &self,
-        training: impl FnOnce() -> Vec<f32>,
-        rows: usize,
-        members: &[Streams],
-        name: &str,
-    ) -> Option<Vec<f32>> {
-        use rand::RngExt;
-        if !self.state.process().starts_at_data() {
-            return None;
-        }
-        let training = training();
-        let d = self.units.live.len();
-        let n = training.len() / d;
-        let mut out = Vec::with_capacity(rows * members.len() * d);
-        for member in members {
-            let mut rng = member.stream(&format!("start/{name}"));
-            for _ in 0..rows {
-                let i = rng.random_range(0..n);
-                out.extend_from_slice(&training[i * d..(i + 1) * d]);
-            }
-        }
-        Some(out)
     }
 
     /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, y_max) and their successors.
@@ -257,11 +235,39 @@ impl Generator {
     }
 }
 
-fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress {
+/// Training rows (width `d`) for processes that start at data, `[P, rows, d]`; the others need none.
+pub(crate) fn start_rows(
+    process: Process,
+    training: impl FnOnce() -> Vec<f32>,
+    d: usize,
+    rows: usize,
+    members: &[Streams],
+    name: &str,
+) -> Option<Vec<f32>> {
+    use rand::RngExt;
+    if !process.starts_at_data() {
+        return None;
+    }
+    let training = training();
+    let n = training.len() / d;
+    let mut out = Vec::with_capacity(rows * members.len() * d);
+    for member in members {
+        let mut rng = member.stream(&format!("start/{name}"));
+        for _ in 0..rows {
+            let i = rng.random_range(0..n);
+            out.extend_from_slice(&training[i * d..(i + 1) * d]);
+        }
+    }
+    Some(out)
+}
+
+/// A progress bar of sampling.
+pub(crate) fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress {
     Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
 }
 
-fn run(
+/// Trains, and keeps the losses; the last ones come back.
+pub(crate) fn run(
     trainer: &mut Trainer,
     data: &ScoreData,
     steps: u64,

@@ -12,6 +12,7 @@ mod expand;
 mod fuzz;
 mod generator;
 mod inputs;
+mod joint;
 mod layers;
 mod learning;
 mod methods;

@@ -3,14 +3,15 @@
 use std::sync::Arc;
 
 use serde::Serialize;
-use tce_data::{Rows, Transitions, TransportOptions, transport_costs};
+use tce_data::{Rows, Transitions, TransportOptions, density_scores, transport_costs};
 use tce_learn::{
-    Bc, Bosa, Buffer, Dara, Igdf, Iql, IqlConfig, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo, Td3Bc,
+    Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo, Td3Bc,
 };
 use tce_nn::Device;
 
-use crate::config::{Algorithm, LearnerConfig};
+use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
+use crate::joint::{enough_to_score, score_streams};
 
 /// What `tce learn --list` prints of a learner.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -31,7 +32,7 @@ pub struct Method {
 
 impl Algorithm {
     /// All of them, in the order of the list.
-    pub const ALL: [Algorithm; 9] = [
+    pub const ALL: [Algorithm; 10] = [
         Algorithm::Bc,
         Algorithm::Iql,
         Algorithm::Td3Bc,
@@ -41,6 +42,7 @@ impl Algorithm {
         Algorithm::Srpo,
         Algorithm::Igdf,
         Algorithm::Otdf,
+        Algorithm::Dmc,
     ];
 
     /// What it is.
@@ -110,6 +112,14 @@ impl Algorithm {
                 "otdf",
                 source,
             ),
+            Algorithm::Dmc => (
+                "dmc",
+                "OTDF's policy; source and guided generated rows chosen and weighed by nearest neighbours",
+                "DmC, ECAI 2025",
+                Some("OTDF's broadcast, and a behaviour model that is never trained"),
+                "dmc",
+                "source rows, or rows of mixture.generated = \"dmc\"",
+            ),
         };
         Method { name, description, reference, published, table, needs }
     }
@@ -129,7 +139,7 @@ pub fn build(
     let (steps, backbone) = (*steps, config.backbone());
     let regulariser = || -> Result<Regulariser> {
         let kind = backbone.as_ref().map_or(Default::default(), |iql: &IqlConfig| iql.regulariser);
-        Regulariser::prepare(kind, buffer, &config.behaviour, place, device)?.ok_or(Error::Interrupted)
+        Regulariser::prepare(kind, buffer, &config.behaviour(), place, device)?.ok_or(Error::Interrupted)
     };
     Ok(match config.algorithm {
         Algorithm::Bc => Box::new(Bc::new(buffer, &config.bc, steps, device)?),
@@ -143,21 +153,27 @@ pub fn build(
             Box::new(igdf.ok_or(Error::Interrupted)?)
         }
         Algorithm::Otdf => Box::new(Otdf::new(buffer, &config.otdf, iql, regulariser()?, steps, device)?),
+        Algorithm::Dmc => Box::new(Dmc::new(buffer, &config.dmc, iql, regulariser()?, steps, device)?),
         Algorithm::Bosa => Box::new(Bosa::new(buffer, &config.bosa, steps, place, device)?.ok_or(Error::Interrupted)?),
     })
 }
 
-/// The number of every row of `others` that the algorithm chooses by, the greater the closer to the target; None if it chooses by
-/// none that is computed before.
+/// The number of every row of `others` that the learner of `config` chooses by, the greater the closer to the target; None if it
+/// chooses by none that is computed before.
 ///
 /// # Errors
-/// If the user interrupts it.
-pub fn row_scores(algorithm: Algorithm, target: &Transitions, others: &Transitions) -> Result<Option<Arc<Vec<f32>>>> {
-    if algorithm != Algorithm::Otdf {
-        return Ok(None);
-    }
-    let costs = transport_costs(&Rows::transitions(others), &Rows::transitions(target), &TransportOptions::default())?;
-    Ok(Some(closeness(costs)))
+/// If there are too few rows, or the user interrupts it.
+pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -> Result<Option<Arc<Vec<f32>>>> {
+    let (rows, near) = (Rows::transitions(others), Rows::transitions(target));
+    Ok(match config.learner.algorithm {
+        Algorithm::Otdf => Some(closeness(transport_costs(&rows, &near, &TransportOptions::default())?)),
+        Algorithm::Dmc => {
+            let options = &config.joint.scores;
+            enough_to_score(others.len(), target.len(), options)?;
+            Some(Arc::new(density_scores(&rows, &near, options, &score_streams())?.source))
+        }
+        _ => None,
+    })
 }
 
 /// -cost: the greater the closer.

@@ -26,19 +26,43 @@ use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::stage::Stage;
 
-/// The rows of a mixture that are not target rows, per member; `None` for target rows alone.
+/// Rows that are no target rows, and perhaps a number for each.
+#[derive(Clone, Debug)]
+pub struct Extra {
+    /// The rows.
+    pub rows: Arc<Transitions>,
+    /// One number per row.
+    pub scores: Option<Arc<Vec<f32>>>,
+}
+
+impl Extra {
+    fn select(&self, indices: &[usize]) -> Self {
+        let scores = self.scores.as_ref().map(|s| Arc::new(indices.iter().map(|&i| s[i]).collect()));
+        Self { rows: Arc::new(self.rows.select(indices)), scores }
+    }
+}
+
+impl From<Arc<Transitions>> for Extra {
+    fn from(rows: Arc<Transitions>) -> Self {
+        Self { rows, scores: None }
+    }
+}
+
+/// The rows of a mixture that are not target rows, per member; `None` for target rows alone. `source_scores` are numbers of all
+/// source rows.
 pub fn extra_rows(
     inputs: &Inputs,
     mixture: &MixtureConfig,
-    generated: Option<&[Arc<Transitions>]>,
+    generated: Option<&[Extra]>,
     labels: Option<&LabelModels>,
+    source_scores: Option<Arc<Vec<f32>>>,
     seeds: &[u64],
     root: &Path,
-) -> Result<Option<Vec<Arc<Transitions>>>> {
-    let selected: Option<Vec<Arc<Transitions>>> = match mixture.source {
+) -> Result<Option<Vec<Extra>>> {
+    let selected: Option<Vec<Extra>> = match mixture.source {
         SourceRows::None => None,
         SourceRows::All => {
-            let all = Arc::new(inputs.source_rows()?.clone());
+            let all = Extra { rows: Arc::new(inputs.source_rows()?.clone()), scores: source_scores };
             Some(vec![all; seeds.len()])
         }
         SourceRows::Relabelled => {
@@ -47,48 +71,47 @@ pub fn extra_rows(
             let pairs = vec![(source.observations.clone(), source.next_observations.clone()); seeds.len()];
             // Only the actions are inferred; everything else stays as the source has it.
             let labelled = models.label(&pairs, TerminalHandling::None)?;
-            let table =
-                |l: tce_learn::Labelled| Arc::new(Transitions { actions: l.transitions.actions, ..source.clone() });
+            let table = |l: tce_learn::Labelled| {
+                Arc::new(Transitions { actions: l.transitions.actions, ..source.clone() }).into()
+            };
             Some(labelled.into_iter().map(table).collect())
         }
         SourceRows::Nearest | SourceRows::Transport => {
             let source = inputs.source_rows()?;
             let indices = lambda_quantile_select(&distances(inputs, mixture.source, root)?, mixture.lambda);
-            let rows = Arc::new(source.select(&indices));
-            Some(vec![rows; seeds.len()])
+            let all = Extra { rows: Arc::new(source.clone()), scores: source_scores };
+            Some(vec![all.select(&indices); seeds.len()])
         }
     };
-    let generated = if mixture.generated { generated } else { None };
     Ok(match (generated, selected) {
         (None, selected) => selected,
         (Some(generated), None) => Some(generated.to_vec()),
         (Some(generated), Some(selected)) => Some(
-            generated
-                .iter()
-                .zip(&selected)
-                .zip(seeds)
-                .map(|((g, s), &seed)| Arc::new(mix(s, g, mixture.lambda, seed)))
-                .collect(),
+            generated.iter().zip(&selected).zip(seeds).map(|((g, s), &seed)| mix(s, g, mixture.lambda, seed)).collect(),
         ),
     })
 }
 
 /// Source and generated rows in the ratio λ : (1 − λ), as many as there are of both; what is too many is left out at
 /// random.
-fn mix(source: &Transitions, generated: &Transitions, lambda: f64, seed: u64) -> Transitions {
-    let total = (source.len() as f64 / lambda).min(generated.len() as f64 / (1.0 - lambda));
+fn mix(source: &Extra, generated: &Extra, lambda: f64, seed: u64) -> Extra {
+    let (sources, others) = (source.rows.len() as f64, generated.rows.len() as f64);
+    let total = (sources / lambda).min(others / (1.0 - lambda));
     let (n_source, n_generated) = ((lambda * total).round() as usize, ((1.0 - lambda) * total).round() as usize);
-    let mut out = subset(source, n_source, Streams::new(seed), "mixture/source");
-    out.extend(&subset(generated, n_generated, Streams::new(seed), "mixture/generated"));
-    out
+    let source = subset(source, n_source, Streams::new(seed), "mixture/source");
+    let generated = subset(generated, n_generated, Streams::new(seed), "mixture/generated");
+    let mut rows = Arc::unwrap_or_clone(source.rows);
+    rows.extend(&generated.rows);
+    let scores = source.scores.zip(generated.scores).map(|(s, g)| Arc::new([s.as_slice(), g.as_slice()].concat()));
+    Extra { rows: Arc::new(rows), scores }
 }
 
 /// `n` rows at random, in their order.
-fn subset(rows: &Transitions, n: usize, streams: Streams, name: &str) -> Transitions {
-    if n >= rows.len() {
+fn subset(rows: &Extra, n: usize, streams: Streams, name: &str) -> Extra {
+    if n >= rows.rows.len() {
         return rows.clone();
     }
-    let mut indices = rand::seq::index::sample(&mut streams.stream(name), rows.len(), n).into_vec();
+    let mut indices = rand::seq::index::sample(&mut streams.stream(name), rows.rows.len(), n).into_vec();
     indices.sort_unstable();
     rows.select(&indices)
 }
@@ -131,18 +154,22 @@ pub fn distances_stage(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result
 mod tests {
     use super::*;
 
-    fn rows(value: f32, n: usize) -> Transitions {
+    fn rows(value: f32, n: usize) -> Arc<Transitions> {
         let mut t = Transitions::new(1, 1);
         for _ in 0..n {
             t.push(&[value], &[0.0], 0.0, &[value], false, false);
         }
-        t
+        Arc::new(t)
     }
 
     #[test]
     fn the_ratio_is_kept_whatever_is_scarce() {
         for (n_source, n_generated) in [(1000, 900), (10, 900), (1000, 18)] {
-            let mixed = mix(&rows(1.0, n_source), &rows(0.0, n_generated), 0.1, 0);
+            let extra =
+                |value: f32, n: usize| Extra { scores: Some(Arc::new(vec![value; n])), ..rows(value, n).into() };
+            let mixed = mix(&extra(1.0, n_source), &extra(0.0, n_generated), 0.1, 0);
+            assert_eq!(mixed.rows.observations, *mixed.scores.unwrap(), "scores stay with their rows");
+            let mixed = mixed.rows;
             let share = mixed.observations.iter().sum::<f32>() / mixed.len() as f32;
             assert!((share - 0.1).abs() < 0.03, "{n_source} {n_generated}: {share}");
             assert!(mixed.len() >= 20);
@@ -153,8 +180,9 @@ mod tests {
     fn a_subset_is_reproducible_and_without_repetition() {
         let mut t = Transitions::new(1, 1);
         (0..100).for_each(|i| t.push(&[i as f32], &[0.0], 0.0, &[0.0], false, false));
-        let a = subset(&t, 30, Streams::new(1), "x");
-        assert_eq!(a, subset(&t, 30, Streams::new(1), "x"));
+        let t = Extra::from(Arc::new(t));
+        let a = subset(&t, 30, Streams::new(1), "x").rows;
+        assert_eq!(a, subset(&t, 30, Streams::new(1), "x").rows);
         assert!(a.observations.windows(2).all(|w| w[0] < w[1]));
     }
 }

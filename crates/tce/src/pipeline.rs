@@ -11,14 +11,16 @@ use tce_nn::Device;
 
 use crate::actors::{Arena, Evaluation};
 use crate::config::{
-    Algorithm, Config, EvaluationConfig, FilterConfig, GeneratorConfig, LabelsConfig, MixtureConfig, SourceRows,
+    Algorithm, Config, EvaluationConfig, FilterConfig, GeneratedRows, GeneratorConfig, LabelsConfig, MixtureConfig,
+    SourceRows,
 };
 use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
+use crate::joint;
 use crate::learning::{Learned, MemberData, learn};
 use crate::methods::{closeness, row_scores};
-use crate::mixture::{distances, extra_rows};
+use crate::mixture::{Extra, distances, extra_rows};
 use crate::stage::Stage;
 
 /// The outcome of a variant.
@@ -56,6 +58,7 @@ struct RunSpec<'a> {
     generator: Option<&'a GeneratorConfig>,
     filter: Option<&'a FilterConfig>,
     labels: Option<&'a LabelsConfig>,
+    joint: Option<serde_json::Value>,
 }
 
 /// What a run says about its policies: `result.json`.
@@ -69,8 +72,12 @@ struct Outcome<'a> {
 impl Config {
     /// Whether source rows are looked at, in any stage.
     pub fn needs_source(&self) -> bool {
-        self.mixture.source != SourceRows::None
-            || (self.mixture.generated && (self.generator.source_states || self.generator.rows == 0))
+        let generating = match self.mixture.generated {
+            GeneratedRows::None | GeneratedRows::Synther => false,
+            GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0,
+            GeneratedRows::Dmc => true,
+        };
+        generating || self.mixture.source != SourceRows::None || self.learner.algorithm == Algorithm::Dmc
     }
 
     /// Which distances of source rows decide, in the mixture or in the learner, if any.
@@ -86,7 +93,18 @@ impl Config {
 
     /// Whether the rows besides the target's are the source's, as they are.
     fn source_alone(&self) -> bool {
-        self.mixture.source == SourceRows::All && !self.mixture.generated
+        self.mixture.source == SourceRows::All && self.mixture.generated == GeneratedRows::None
+    }
+
+    /// The number of every source row by which the learner chooses, where it is computed once for all seeds.
+    fn source_scores(&self, inputs: &Inputs, root: &Path) -> Result<Option<Arc<Vec<f32>>>> {
+        match self.learner.algorithm {
+            Algorithm::Dmc => Ok(Some(Arc::new(joint::scores(inputs, &self.joint.scores, root)?.source))),
+            Algorithm::Otdf if self.source_alone() => {
+                Ok(Some(closeness(distances(inputs, SourceRows::Transport, root)?)))
+            }
+            _ => Ok(None),
+        }
     }
 }
 
@@ -100,7 +118,8 @@ pub fn run(
     place: &str,
     device: &Device,
 ) -> Result<Summary> {
-    let generated = config.mixture.generated;
+    let generated = config.mixture.generated != GeneratedRows::None;
+    let two_stages = config.mixture.generated == GeneratedRows::Tce;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
     let spec = RunSpec {
         inputs: inputs.spec(config.needs_source()),
@@ -108,9 +127,10 @@ pub fn run(
         mixture: &config.mixture,
         learner: config.learner.used(),
         evaluation: &config.evaluation,
-        generator: generated.then_some(&config.generator),
-        filter: generated.then_some(&config.filter),
-        labels: (generated || relabelled).then_some(&config.labels),
+        generator: two_stages.then_some(&config.generator),
+        filter: two_stages.then_some(&config.filter),
+        labels: (two_stages || relabelled).then_some(&config.labels),
+        joint: config.joint.used(config.mixture.generated, config.learner.algorithm),
     };
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec)?;
     if let Some(summary) = stage.summary::<Summary>()? {
@@ -132,34 +152,31 @@ pub fn run(
             files.push(report.file.clone());
         }
         reports = expansion.reports;
-        tables = Some(expansion.tables);
+        let scored = expansion.tables.into_iter().zip(expansion.scores);
+        tables = Some(scored.map(|(rows, scores)| Extra { rows, scores }).collect::<Vec<_>>());
     }
     let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
-    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), seeds, root)?;
+    let scores = config.source_scores(inputs, root)?;
+    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
     drop((tables, models));
 
     let target = Arc::new(inputs.target.rows.clone());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
         // Generated rows among them are no trajectories.
-        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].clone() });
+        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
     }
-    let scores: Vec<_> = match &extra {
-        // Kept as a stage: every seed has the same rows.
-        Some(_) if config.source_alone() && config.distances().is_some() => {
-            vec![Some(closeness(distances(inputs, SourceRows::Transport, root)?)); seeds.len()]
-        }
-        Some(extra) => {
-            let of = |others: &Arc<_>| row_scores(config.learner.algorithm, &target, others);
-            extra.iter().map(of).collect::<Result<_>>()?
-        }
-        None => vec![None; seeds.len()],
+    let scores = |rows: &Extra| match &rows.scores {
+        Some(scores) => Ok(Some(scores.clone())),
+        // Generated rows among them are each seed's own.
+        None => row_scores(config, &target, &rows.rows),
     };
+    let scores = extra.iter().flatten().map(scores).collect::<Result<Vec<_>>>()?;
     let data = |(m, &seed): (usize, &u64)| MemberData {
         seed,
         target: target.clone(),
-        extra: extra.as_ref().map(|e| e[m].clone()),
-        row_scores: scores[m].clone(),
+        extra: extra.as_ref().map(|e| e[m].rows.clone()),
+        row_scores: scores.get(m).cloned().flatten(),
         trajectories: trajectories.clone(),
     };
     let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
@@ -167,7 +184,7 @@ pub fn run(
         (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
     };
-    let extra_count = extra.as_ref().map_or(0, |e| e[0].len());
+    let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
     drop(extra);
     let place = (attempt.directory(), attempt.key());
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {

@@ -56,6 +56,12 @@ pub enum Variant {
     Td3Bc,
     /// ReBRAC on target and source rows.
     Rebrac,
+    /// IQL on target rows and rows of a model of whole target transitions (SynthER).
+    Synther,
+    /// DmC, corrected: source rows and guided generated rows, filtered and weighed by their scores.
+    Dmc,
+    /// DmC as its code runs.
+    DmcPublished,
     /// Behaviour cloning of the target rows, observations as they are.
     BcRaw,
     /// Behaviour cloning of the target rows, observations standardised: the floor.
@@ -92,6 +98,8 @@ impl Variant {
             Variant::Otdf | Variant::OtdfPublished => "OTDF",
             Variant::Td3Bc => "TD3+BC",
             Variant::Rebrac => "ReBRAC",
+            Variant::Synther => "SynthER",
+            Variant::Dmc | Variant::DmcPublished => "DmC",
             Variant::BcRaw => "BC, raw observations",
             Variant::Bc => "BC, standardised",
             Variant::BcTop => "BC, best half",
@@ -114,11 +122,12 @@ impl Variant {
 
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
     pub(crate) fn layer(self, lambda: f64, shift: Option<Shift>) -> String {
-        let iql = |generated: bool, source: &str, lambda: f64| {
-            format!("mixture = {{ generated = {generated}, source = {source:?}, lambda = {lambda:?} }}\n")
+        let iql = |generated: &str, source: &str, lambda: f64| {
+            format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n")
         };
         let rival = |algorithm: &str, table: &str, rest: &str| {
-            let mixture = iql(false, "all", 1.0);
+            // As many generated rows as source rows, as DmC generates them.
+            let mixture = if table == "dmc" { iql("dmc", "all", 0.5) } else { iql("none", "all", 1.0) };
             format!("{mixture}learner.algorithm = {algorithm:?}\nlearner.iql.regulariser = \"none\"\n")
                 + rest
                 + &match self.name().ends_with("-published") {
@@ -128,26 +137,28 @@ impl Variant {
         };
         // OTDF's own choice of its β_reg.
         let beta_reg = if shift == Some(Shift::Kinematic) { "learner.otdf.beta_reg = 0.1\n" } else { "" };
-        let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql(false, "none", 0.0));
+        let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql("none", "none", 0.0));
         match self {
-            Variant::TceOg => iql(true, "none", 0.0),
-            Variant::TceNn => iql(true, "nearest", lambda),
-            Variant::TceOt => iql(true, "transport", lambda),
+            Variant::TceOg => iql("tce", "none", 0.0),
+            Variant::TceNn => iql("tce", "nearest", lambda),
+            Variant::TceOt => iql("tce", "transport", lambda),
             Variant::SimpleAug => {
-                format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql(true, "none", 0.0))
+                format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql("tce", "none", 0.0))
             }
             Variant::TargetOnly => {
-                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql(false, "none", 0.0))
+                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql("none", "none", 0.0))
             }
-            Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "all", 1.0)),
-            Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql(false, "relabelled", 1.0)),
-            Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql(true, "none", 0.0)),
-            Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql(true, "none", 0.0)),
+            Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "all", 1.0)),
+            Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "relabelled", 1.0)),
+            Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql("tce", "none", 0.0)),
+            Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql("tce", "none", 0.0)),
             Variant::Dara | Variant::DaraPublished => rival("dara", "dara", ""),
             Variant::Bosa | Variant::BosaPublished => rival("bosa", "bosa", ""),
             Variant::Srpo | Variant::SrpoPublished => rival("srpo", "srpo", ""),
             Variant::Igdf | Variant::IgdfPublished => rival("igdf", "igdf", ""),
             Variant::Otdf | Variant::OtdfPublished => rival("otdf", "otdf", beta_reg),
+            Variant::Synther => format!("{}learner.iql.regulariser = \"none\"\n", iql("synther", "none", 0.0)),
+            Variant::Dmc | Variant::DmcPublished => rival("dmc", "dmc", ""),
             Variant::Td3Bc => rival("td3-bc", "td3_bc", ""),
             Variant::Rebrac => rival("rebrac", "rebrac", ""),
             Variant::BcRaw => bc("learner.standardise = false\n"),

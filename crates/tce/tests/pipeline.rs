@@ -147,6 +147,64 @@ fn learners_are_listed() {
     assert_eq!(tce(dir.path(), &["learn"]).status.code(), Some(2), "without --list, files are needed");
 }
 
+/// Rivals whose rows come from one network over whole transitions: the same bytes at any thread count, one stage for both forms of
+/// DmC, scores beside generated rows, and nothing of the source for SynthER.
+#[test]
+fn rivals_of_whole_transitions_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Ant, Shift::Morph);
+    let run = |out: &str, threads: &str, sets: &[&str]| {
+        let mut args = vec!["run", "ant-morph:medium->expert", "--variant", "synther,dmc,dmc-published", "--no-floors"];
+        args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+        args.extend(["--out", out, "--threads", threads, "--seeds", "2"]);
+        args.extend(TINY);
+        args.extend(["--set", "joint.scores.reference=500", "--set", "learner.behaviour.cvae.hidden=[32]"]);
+        args.extend(sets);
+        tce_json(dir.path(), &args)
+    };
+    let (one, two) = (run("one", "1", &[]), run("two", "2", &[]));
+    let rows = one["rows"].as_array().unwrap();
+    for (a, b) in rows.iter().zip(two["rows"].as_array().unwrap()) {
+        assert!(a["scores"][1].is_number() && a["scores"] == b["scores"], "{a} {b}");
+    }
+    let [a, b] = ["one", "two"].map(|o| results(&dir.path().join(o)));
+    assert_eq!(a.len(), b.len());
+    assert!(a.iter().zip(&b).all(|(a, b)| a == b), "another number of threads gave other bytes");
+
+    let of = |variant: &str| rows.iter().find(|r| r["variant"] == variant).unwrap();
+    let (synther, dmc, published) = (of("synther"), of("dmc"), of("dmc-published"));
+    assert_eq!(
+        (&synther["extra_rows"], &dmc["extra_rows"]),
+        (&600.into(), &1200.into()),
+        "as many source as generated rows"
+    );
+    assert_eq!((&synther["generated"][0]["evaluations"], &dmc["generated"][0]["evaluations"]), (&4.into(), &8.into()));
+    assert_ne!(dmc["scores"], published["scores"], "the modes differ");
+    let file = |row: &serde_json::Value, name: &str| dir.path().join(row["directory"].as_str().unwrap()).join(name);
+    let generated = |row| fs::read(file(row, "generated-seed1.hdf5")).unwrap();
+    assert!(generated(dmc) == generated(published), "and learn from the same rows");
+    let options = LoadOptions { columns: vec!["score".into()], ..LoadOptions::default() };
+    let loaded = load(&file(dmc, "generated-seed0.hdf5"), &options).unwrap();
+    assert!(loaded.columns["score"].iter().all(|s| *s > 0.0 && *s <= 1.0));
+    assert!(loaded.transitions.actions.iter().all(|a| a.abs() <= 1.0));
+    let tail = loaded.transitions.observations.chunks(111).flat_map(|s| &s[27..]);
+    assert!(tail.copied().all(|v| v == 0.0), "Ant's contact slots stay zero");
+    let stages = fs::read_dir(dir.path().join("one/stages")).unwrap().flatten();
+    let mut kinds: Vec<String> =
+        stages.map(|e| e.file_name().to_string_lossy().split('-').next().unwrap().to_owned()).collect();
+    kinds.sort();
+    assert_eq!(kinds, ["generated", "generated", "joint", "joint", "scores"]);
+    let spec = fs::read_to_string(file(synther, "spec.json")).unwrap();
+    assert!(spec.contains("\"source\":null"), "{spec}");
+
+    // Unscored rows cannot be learned from in DmC's way.
+    let mut args = vec!["run", "ant-morph:medium->expert", "--variant", "dmc", "--set", "mixture.generated=tce"];
+    args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+    let refused = tce(dir.path(), &args);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(common::message(&refused).contains("expected rows that have scores"), "{}", common::message(&refused));
+}
+
 /// The paper's process, sampler and learner, cut short; rows as many as the paper generates, (1 - λ) |D_src|.
 #[test]
 fn the_papers_preset_runs() {

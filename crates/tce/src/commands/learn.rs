@@ -93,7 +93,7 @@ impl Learn {
         }
         let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
         let row_scores = match &extra {
-            Some(extra) => row_scores(config.learner.algorithm, &target, extra)?,
+            Some(extra) => row_scores(&config, &target, extra)?,
             None => None,
         };
         let member = |&seed: &u64| MemberData {

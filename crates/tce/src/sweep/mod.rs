@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{FileError, read_if_there, sha256_hex, write_atomically};
 
 use crate::PROGRAM;
-use crate::config::{Config, SourceRows};
+use crate::config::{Config, GeneratedRows, SourceRows};
 use crate::error::{Error, Result};
 use crate::inputs::DataArgs;
 use crate::layers::{Layered, Preset};
@@ -310,21 +310,18 @@ impl Manifest {
             let distances = self.add(known, entry(Kind::Distances, spec, 0, needs.clone()));
             needs.push(distances);
         }
-        if config.mixture.generated || config.mixture.source == SourceRows::Relabelled {
-            let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
-            let generated = config.mixture.generated;
-            let spec = serde_json::json!([
-                task,
-                data,
-                from_zoo,
-                config.source,
-                config.generator,
-                config.filter,
-                config.labels,
-                lambda,
-                generated,
-                seed
-            ]);
+        let generated = config.mixture.generated;
+        if generated != GeneratedRows::None || config.mixture.source == SourceRows::Relabelled {
+            let own = match generated {
+                GeneratedRows::Synther | GeneratedRows::Dmc => {
+                    serde_json::json!(config.joint.used(generated, config.learner.algorithm))
+                }
+                GeneratedRows::Tce | GeneratedRows::None => {
+                    let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
+                    serde_json::json!([config.generator, config.filter, config.labels, lambda])
+                }
+            };
+            let spec = serde_json::json!([task, data, from_zoo, config.source, generated, own, seed]);
             let before = needs.clone();
             needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
         }
@@ -535,6 +532,40 @@ mod tests {
         assert_eq!(generated.needs.len(), 3);
         let ids: BTreeSet<_> = manifest.entries.iter().map(|e| &e.id).collect();
         assert_eq!(ids.len(), manifest.entries.len());
+    }
+
+    #[test]
+    fn rivals_share_their_generated_rows() {
+        let manifest = plan(
+            r#"
+            tasks = ["hopper-morph:medium->expert"]
+            variants = ["dmc", "dmc-published", "synther", "tce-og"]
+            floors = false
+            seeds = 2
+            overrides = [
+                { name = "", set = [] },
+                { name = "w", set = ["learner.dmc.cut_off=0.2", "generator.y_max=0.1"] },
+            ]
+            "#,
+        )
+        .unwrap();
+        let needs = |variant: Variant, label: &str, seed: u64| {
+            let run = |e: &&Entry| e.variant == Some(variant) && e.label == label && e.seed == seed;
+            let entry = manifest.entries.iter().find(run).unwrap();
+            let kinds = entry.needs.iter().map(|&n| manifest.entries[n].kind).collect::<Vec<_>>();
+            (entry.needs.last().copied().unwrap(), kinds)
+        };
+        let (dmc, kinds) = needs(Variant::Dmc, "", 0);
+        assert_eq!(kinds, [Kind::Target, Kind::Source, Kind::Expand]);
+        assert_eq!(needs(Variant::DmcPublished, "", 0).0, dmc);
+        // Neither what the learner does with them, nor the keys of another generator, makes other rows.
+        assert_eq!(needs(Variant::Dmc, "w", 0).0, dmc);
+        let (synther, kinds) = needs(Variant::Synther, "", 0);
+        assert_eq!(kinds, [Kind::Target, Kind::Expand], "SynthER looks at no source");
+        assert_eq!(needs(Variant::Synther, "w", 0).0, synther);
+        assert_ne!(needs(Variant::Dmc, "", 1).0, dmc);
+        // dmc and synther, and tce-og under two y_max, of two seeds.
+        assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Expand).count(), 2 * (2 + 2));
     }
 
     #[test]

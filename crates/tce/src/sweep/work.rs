@@ -13,6 +13,7 @@ use tce_nn::cpu;
 
 use super::{Entry, Kind, Sweep};
 use crate::PROGRAM;
+use crate::config::GeneratedRows;
 use crate::error::{Error, Result};
 use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
@@ -180,8 +181,8 @@ impl Sweep {
             Kind::Expand => {
                 let inputs = Inputs::of_task(entry.task, &args, rows)?;
                 let stage = match config.mixture.generated {
-                    true => expand(&inputs, &config, seeds, root, &cpu())?.stage,
-                    false => label_models(&inputs, &config.labels, seeds, root, &cpu())?.1,
+                    GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, &cpu())?.1,
+                    _ => expand(&inputs, &config, seeds, root, &cpu())?.stage,
                 };
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
             }

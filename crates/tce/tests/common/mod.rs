@@ -122,4 +122,12 @@ pub const TINY: &[&str] = &[
     "learner.batch=32",
     "--set",
     "evaluation.episodes=2",
+    "--set",
+    "joint.steps=40",
+    "--set",
+    "joint.rows=600",
+    "--set",
+    "joint.sampler.steps=4",
+    "--set",
+    "joint.width=32",
 ];
