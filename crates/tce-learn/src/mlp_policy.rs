@@ -1,4 +1,4 @@
-//! Trained policies, apart from how they were trained: from observations to actions on the host.
+//! Policies without a memory: multi-layer perceptrons from observations to actions.
 //!
 //! x = clip((o - mean) / std) over the input dimensions, z = MLP(x), and an action in the box [-1, 1]:
 //!
@@ -16,12 +16,13 @@ use tce_data::Standardizer;
 use tce_nn::{Activation, Mlp, MlpConfig, Module, NamedParameters, cpu, host, tensor};
 
 use crate::error::LearnError;
+use crate::policy::Policy;
 
 /// Range of ln σ of a state-dependent Gaussian head.
 pub const LOG_STD_RANGE: (f32, f32) = (-20.0, 2.0);
 
 /// Key of the specification in a policy file's metadata.
-const KEY: &str = "policy";
+pub(crate) const KEY: &str = "policy";
 
 /// How the network's output becomes an action.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -99,12 +100,12 @@ impl PolicySpec {
 
 /// One policy, ready to act.
 #[derive(Clone, Debug)]
-pub struct Policy {
+pub struct MlpPolicy {
     spec: PolicySpec,
     network: Mlp,
 }
 
-impl Policy {
+impl MlpPolicy {
     /// A policy of the given weights, named `{prefix}.layers.{k}.weight` and `.bias`; `path` is where they came from.
     ///
     /// # Errors
@@ -125,17 +126,6 @@ impl Policy {
         &self.spec
     }
 
-    /// Reads a policy: `.safetensors` (ours) or `.npz` (plain arrays of other programs, see [`crate::import`]).
-    ///
-    /// # Errors
-    /// If the file is missing, damaged, or not a policy.
-    pub fn load(path: &Path) -> Result<Self, LearnError> {
-        if path.extension().is_some_and(|e| e == "npz") {
-            return crate::import::load_npz(path);
-        }
-        Self::from_parameters(&NamedParameters::load(path)?, path)
-    }
-
     /// The policy of a file that was read before; `path` is for messages.
     ///
     /// # Errors
@@ -153,21 +143,13 @@ impl Policy {
         Self::new(spec, parameters, KEY, path)
     }
 
-    /// The weights and, in the metadata, the specification. Callers may add metadata of their own before saving.
+    /// The weights and, in the metadata, the specification.
     pub fn to_parameters(&self) -> NamedParameters {
         let mut out = NamedParameters::default();
         out.collect(KEY, &self.network);
         let json = serde_json::to_string(&self.spec).expect("plain numbers");
         out.metadata.insert(KEY.into(), json);
         out
-    }
-
-    /// Writes a safetensors file, whole or not at all.
-    ///
-    /// # Errors
-    /// If it cannot be written.
-    pub fn save(&self, path: &Path) -> Result<(), LearnError> {
-        Ok(self.to_parameters().save(path)?)
     }
 
     /// Fills `actions` `[rows, d_a]` for `observations` `[rows, d_s]`, both row-major: mean actions, or, with one
@@ -215,8 +197,9 @@ impl Policy {
 pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -> Vec<Policy> {
     let mut all = NamedParameters::default();
     all.collect(KEY, networks);
-    let policy = |(m, spec)| Policy::new(spec, &all.member(m), KEY, Path::new("(in memory)"));
-    specs.into_iter().enumerate().map(|x| policy(x).expect("the networks were made from the specification")).collect()
+    let policy = |(m, spec)| MlpPolicy::new(spec, &all.member(m), KEY, Path::new("(in memory)"));
+    let made = |x| Policy::Mlp(policy(x).expect("the networks were made from the specification"));
+    specs.into_iter().enumerate().map(made).collect()
 }
 
 #[cfg(test)]
@@ -241,10 +224,13 @@ mod tests {
         }
     }
 
-    fn policy(head: Head) -> Policy {
+    fn policy(head: Head) -> MlpPolicy {
         let spec = spec(head);
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
-        from_population(vec![spec], &network).remove(0)
+        match from_population(vec![spec], &network).remove(0) {
+            Policy::Mlp(policy) => policy,
+            other => panic!("{other:?}"),
+        }
     }
 
     fn observations(rows: usize) -> Vec<f32> {
@@ -300,38 +286,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn files_keep_every_bit() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("policy.safetensors");
-        let saved = policy(Head::Gaussian { log_std: vec![-0.1, 1.0 / 3.0] });
-        saved.save(&path).unwrap();
-        let loaded = Policy::load(&path).unwrap();
-        assert_eq!(loaded.spec(), saved.spec());
-        let (mut a, mut b) = (vec![0.0; 8], vec![0.0; 8]);
-        saved.act(&observations(4), None, &mut a);
-        loaded.act(&observations(4), None, &mut b);
-        assert_eq!(a, b);
-    }
-
-    #[test]
-    fn what_is_not_a_policy_is_refused() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("policy.safetensors");
-        NamedParameters::default().save(&path).unwrap();
-        assert!(Policy::load(&path).unwrap_err().to_string().contains("a policy's specification"));
-        let mut parameters = policy(Head::Mean).to_parameters();
-        let json = parameters.metadata[KEY].replace("\"inputs\":[0,2]", "\"inputs\":[0,3]");
-        parameters.metadata.insert(KEY.into(), json);
-        parameters.save(&path).unwrap();
-        assert!(Policy::load(&path).unwrap_err().to_string().contains("dimensions below 3"));
-    }
-
-    #[test]
-    fn policies_are_shared_between_threads() {
-        fn sync<T: Send + Sync>(_: &T) {}
-        sync(&policy(Head::Mean));
     }
 }
