@@ -43,7 +43,7 @@ use crate::sequence_policy::{SequencePolicy, SequenceSpec};
 use crate::sequences::{Segments, Trajectories};
 use crate::training::{Learner, Meter, PolicyLearner};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
-use crate::world_model::{SegmentTensors, WorldModel, WorldModelConfig};
+use crate::world_model::{Contexts, Place, SegmentTensors, WorldModel, WorldModelConfig, strip};
 
 /// The configuration of [`MetaDt`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -147,6 +147,8 @@ struct MemberNets {
     streams: Streams,
     trajectories: Trajectories,
     world: Trained<WorldModel>,
+    /// Of the finished world model.
+    contexts: Contexts,
     transformer: Trained<DecisionTransformer>,
 }
 
@@ -167,9 +169,11 @@ impl MetaDt {
         let nets = |member: &crate::buffer::Member| {
             let world = config.world_model.init(inputs, actions, member.streams, &trainable);
             let transformer = sizes(config, inputs, actions).init(member.streams, &trainable);
+            let trajectories = Trajectories::new(member);
             MemberNets {
                 streams: member.streams,
-                trajectories: Trajectories::new(member),
+                contexts: Contexts::new(&trajectories, config.world_model.latent),
+                trajectories,
                 world: Trained::with(world, clipped(config.world_model.grad_clip, 0.0)),
                 transformer: Trained::with(transformer, clipped(config.grad_clip, config.weight_decay)),
             }
@@ -197,47 +201,45 @@ fn sizes(c: &MetaDtConfig, inputs: usize, actions: usize) -> TransformerSizes {
     }
 }
 
-/// The transformer's input for segments with contexts, and where they have steps `[B, K, 1]`.
-fn input(c: &MetaDtConfig, segments: &Segments, batch: &SegmentTensors, contexts: Tensor<3>) -> TransformerInput {
-    let device = batch.s.device();
-    let shape = [c.batch, c.context];
-    let returns = segments.returns_to_go.iter().map(|r| r / c.return_scale as f32).collect();
-    let times: Vec<i32> = segments.times.iter().map(|t| (*t).min(c.timesteps as i32 - 1)).collect();
-    TransformerInput {
-        returns: tensor(returns, [c.batch, c.context, 1], &device),
-        states: batch.s.clone(),
-        contexts,
-        actions: batch.a.clone(),
-        times: Tensor::<2, Int>::from_data(TensorData::new(times, shape), &device),
-    }
-}
-
 impl MemberNets {
     /// A step down L_W; its two terms.
     fn world_step(&mut self, segments: &Segments, c: &WorldModelConfig, device: &Device) -> [f64; 2] {
-        let batch = SegmentTensors::new(segments, c.batch, 1, device);
-        let [state, reward] = self.world.net().losses(&batch);
+        let batch = SegmentTensors::new(segments, 1, device);
+        let [state, reward] = self.world.net().losses(&batch, strip(segments, c.batch, device));
         let figures = [&state, &reward].map(|l| host(l.clone())[0] as f64);
         self.world.step(state + reward, c.lr);
         figures
     }
 
-    /// L_π of segments, `[1]`.
-    fn policy_loss(
-        &self,
-        segments: &Segments,
-        c: &MetaDtConfig,
-        dropout: Option<&mut Dropout>,
-        device: &Device,
-    ) -> Tensor<1> {
-        let batch = SegmentTensors::new(segments, c.batch, c.context, device);
-        // Outside of autodiff: the world model stays.
-        let contexts = batch.contexts(&self.world.net().encoder.valid());
-        let actions = self.transformer.net().forward(input(c, segments, &batch, contexts), dropout);
-        let steps = segments.valid.iter().sum::<f32>();
-        let valid = tensor(segments.valid.clone(), [c.batch, c.context, 1], device);
-        let width = actions.dims()[2] as f32;
-        ((actions - batch.a).square() * valid).sum() / (steps * width)
+    /// π at the steps of `segments`, `[B, K, A]`.
+    fn actions(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<3> {
+        let encoder = self.world.net().encoder.valid();
+        let contexts = self.contexts.of(segments, c.context, &encoder, &self.trajectories, place);
+        let batch = SegmentTensors::new(segments, c.context, place.device);
+        let shape = [c.batch, c.context];
+        let on_device = |v: Vec<f32>| {
+            let width = v.len() / (c.batch * c.context);
+            tensor(v, [c.batch, c.context, width], place.device)
+        };
+        let times: Vec<i32> = segments.times.iter().map(|t| (*t).min(c.timesteps as i32 - 1)).collect();
+        let input = TransformerInput {
+            returns: on_device(segments.returns_to_go.iter().map(|r| r / c.return_scale as f32).collect()),
+            states: batch.s,
+            contexts: on_device(contexts),
+            actions: batch.a,
+            times: Tensor::<2, Int>::from_data(TensorData::new(times, shape), place.device),
+        };
+        self.transformer.net().forward(input, dropout)
+    }
+
+    /// L_π of `segments`, `[1]`.
+    fn policy_loss(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<1> {
+        let actions = self.actions(segments, place, c, dropout);
+        let [b, k, width] = actions.dims();
+        let data = tensor(segments.actions.clone(), [b, k, width], place.device);
+        let valid = tensor(segments.valid.clone(), [b, k, 1], place.device);
+        let numbers = segments.valid.iter().sum::<f32>() * width as f32;
+        ((actions - data).square() * valid).sum() / numbers
     }
 }
 
@@ -249,9 +251,10 @@ impl Learner for MetaDt {
         let mut figures: [Vec<f64>; 2] = Default::default();
         for (m, nets) in members.iter_mut().enumerate() {
             if let Some(step) = step.checked_sub(w.steps) {
-                let segments = nets.trajectories.sample(buffer, m, w.steps + step, [c.batch, c.context, w.horizon]);
+                let segments = nets.trajectories.sample(buffer, m, w.steps + step, [c.batch, c.context, 0]);
                 let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
-                let loss = nets.policy_loss(&segments, c, Some(&mut dropout), device);
+                let place = Place { buffer, member: m, device };
+                let loss = nets.policy_loss(&segments, place, c, &mut dropout);
                 figures[0].push(host(loss.clone())[0] as f64);
                 nets.transformer.step(loss, c.rate(step));
             } else {
@@ -282,6 +285,7 @@ impl Learner for MetaDt {
         for (m, nets) in self.members.iter_mut().enumerate() {
             nets.world.load(&format!("world.{m}"), state, path)?;
             nets.transformer.load(&format!("transformer.{m}"), state, path)?;
+            nets.contexts = Contexts::new(&nets.trajectories, self.config.world_model.latent);
         }
         Ok(())
     }
@@ -307,5 +311,87 @@ impl PolicyLearner for MetaDt {
             Policy::Sequence(Box::new(policy))
         };
         self.members.iter().zip(buffer.members()).map(policy).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+    use tce_base::random::fill_normal;
+    use tce_data::{Standardizer, Transitions};
+    use tce_nn::cpu;
+
+    /// Episodes of 7, 1 and 5 steps, of three observations (one of them constant), two actions.
+    fn learner() -> (MetaDt, Arc<Transitions>) {
+        let mut t = Transitions::new(3, 2);
+        let mut row = [0.0; 9];
+        for i in 0..13 {
+            fill_normal(&mut Streams::new(3).indexed("row", i), &mut row);
+            (row[1], row[7]) = (4.0, 4.0);
+            t.push(&row[..3], &[row[3].tanh(), row[4].tanh()], row[5], &row[6..], i == 6, i == 7);
+        }
+        let t = Arc::new(t);
+        let standardizer = Standardizer::fit(&t.observations, 3);
+        let member =
+            crate::Member { streams: Streams::new(1), parts: vec![t.clone()], standardizer, reward_scale: 1.0 };
+        let buffer = Buffer::new(vec![member], 2).unwrap();
+        let mut config = MetaDtConfig { context: 3, embed: 16, heads: 2, batch: 5, ..MetaDtConfig::default() };
+        (config.timesteps, config.return_scale) = (4, 2.0);
+        (config.world_model.horizon, config.world_model.gru) = (2, 8);
+        (MetaDt::new(&buffer, &config, &cpu()).unwrap(), t)
+    }
+
+    /// The loss of a batch, from the actions of the finished policy as it is led through the table's episodes step by step: what
+    /// training computes is what an evaluation computes, and the loss is the mean over the steps that are there.
+    #[test]
+    fn the_loss_is_that_of_the_policy_that_acts() {
+        let (mut learner, t) = learner();
+        let mut policy = learner.policies().remove(0);
+        let mut errors = vec![0.0; t.len()];
+        for episode in t.episodes() {
+            let Policy::Sequence(sequence) = &mut policy else { panic!("a policy with a memory") };
+            // What the data got in this episode is what the policy is asked for.
+            let mut memory = sequence.asked(episode.episode_return).start();
+            let mut a = [0.0; 2];
+            for i in episode.start..episode.end {
+                sequence.act(t.observation(i), &mut [&mut memory], &mut a);
+                errors[i] = a.iter().zip(t.action(i)).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+                // As if it had done what the data did.
+                memory.act(t.action(i));
+                memory.reward(t.rewards[i].into());
+            }
+        }
+        let MetaDt { config: c, buffer, members, device } = &mut learner;
+        let nets = &mut members[0];
+        let segments = nets.trajectories.sample(buffer, 0, 11, [c.batch, c.context, 0]);
+        let place = Place { buffer, member: 0, device };
+        let loss = host(nets.policy_loss(&segments, place, c, &mut Dropout::none()))[0];
+        let begin = |row: usize| [0, 7, 8].into_iter().rfind(|b| *b <= row).unwrap();
+        let rows = segments.picks.iter().flat_map(|p| {
+            let row = p.row as usize;
+            begin(row).max((row + 1).saturating_sub(3))..row + 1
+        });
+        let rows: Vec<_> = rows.collect();
+        // The policy sees three steps, a segment's later steps as well; a segment that begins within an episode sees fewer.
+        let whole: Vec<_> = segments.picks.iter().map(|p| p.row as usize).collect();
+        assert!(rows.len() > whole.len());
+        let per_step = host(nets.actions(&segments, place, c, &mut Dropout::none()));
+        for (k, row) in whole.into_iter().enumerate() {
+            let last = segments.valid[3 * k..][..3].iter().filter(|v| **v > 0.0).count() - 1;
+            let own = &per_step[(3 * k + last) * 2..][..2];
+            let error = own.iter().zip(t.action(row)).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+            assert!((error - errors[row]).abs() < 1e-5, "row {row}: {error} {}", errors[row]);
+        }
+        let own = per_step.chunks(2).zip(segments.actions.chunks(2)).zip(&segments.valid);
+        let sum: f32 = own.map(|((a, b), v)| v * ((a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2))).sum();
+        assert!((loss - sum / (2.0 * rows.len() as f32)).abs() < 1e-6, "{loss}");
+    }
+
+    #[test]
+    fn the_rate_rises_and_stays() {
+        let c = MetaDtConfig::default();
+        assert!((c.rate(0) - 5e-9).abs() < 1e-18 && (c.rate(4999) - 2.5e-5).abs() < 1e-15);
+        assert_eq!((c.rate(9_999), c.rate(1 << 40)), (5e-5, 5e-5));
     }
 }

@@ -1,12 +1,21 @@
-//! What networks of burn's own modules need here: initial weights and dropout from named streams. burn draws both from one
-//! generator of the whole process, whose numbers depend on which thread asks first.
+//! What networks of burn's own modules need here.
+//!
+//! - Initial weights and dropout from named streams: burn draws both from one generator of the whole process, whose numbers
+//!   depend on which thread asks first.
+//! - The fused operations of `tce-nn` on the parameters of burn's modules: the modules' own forward passes are the definition, and
+//!   the oracle in tests; a decision transformer's update takes TIMES as long with them.
 
 use rand::Rng as _;
 use tce_base::random::{fill_normal, fill_uniform};
 use tce_base::{Rng, Streams};
-use tce_nn::Module;
 use tce_nn::burn::module::{ModuleMapper, Param};
+use tce_nn::burn::nn::attention::MultiHeadAttention;
+use tce_nn::burn::nn::transformer::PositionWiseFeedForward;
+use tce_nn::burn::nn::{LayerNorm, Linear};
+use tce_nn::burn::tensor::Bool;
+use tce_nn::burn::tensor::activation::softmax;
 use tce_nn::burn::tensor::{Tensor, TensorData};
+use tce_nn::{Activation, Module, dense, layer_norm};
 
 /// How one parameter begins.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,7 +84,7 @@ impl<R: Fn(&str) -> Start> ModuleMapper for Initialiser<R> {
 
 /// Dropout with masks from a stream of a member.
 pub(crate) struct Dropout {
-    rng: Rng,
+    rng: Option<Rng>,
     /// Of 65536.
     dropped: u32,
 }
@@ -83,24 +92,67 @@ pub(crate) struct Dropout {
 impl Dropout {
     /// Sets elements to 0 with probability `rate` and divides the others by 1 - `rate`.
     pub(crate) fn new(rate: f64, rng: Rng) -> Self {
-        Self { rng, dropped: (rate * 65536.0).round() as u32 }
+        Self { rng: Some(rng), dropped: (rate * 65536.0).round() as u32 }
+    }
+
+    /// That of a network that is not trained: none.
+    pub(crate) fn none() -> Self {
+        Self { rng: None, dropped: 0 }
     }
 
     /// With the next mask.
     pub(crate) fn apply<const D: usize>(&mut self, x: Tensor<D>) -> Tensor<D> {
-        if self.dropped == 0 {
-            return x;
-        }
+        let Some(rng) = self.rng.as_mut().filter(|_| self.dropped > 0) else { return x };
         let dims = x.dims();
         // Two bytes an element: a float each would cost twice the time, which is a tenth of an update.
         let mut bytes = vec![0; 2 * dims.iter().product::<usize>()];
-        self.rng.fill_bytes(&mut bytes);
+        rng.fill_bytes(&mut bytes);
         let kept = 65536.0 / (65536 - self.dropped) as f32;
         let draws = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
         let mask: Vec<f32> = draws.map(|draw| if draw < self.dropped { 0.0 } else { kept }).collect();
         let device = x.device().inner();
         x * Tensor::from_inner(Tensor::from_data(TensorData::new(mask, dims), &device))
     }
+}
+
+/// act of the layer of `x` `[A, B, I]`: `[A, B, O]`.
+pub(crate) fn affine(layer: &Linear, x: Tensor<3>, act: Activation) -> Tensor<3> {
+    let ([a, b, i], weight) = (x.dims(), layer.weight.val());
+    let o = weight.dims()[1];
+    let bias = layer.bias.as_ref().expect("every layer here has one").val().reshape([1, 1, o]);
+    dense(x.reshape([1, a * b, i]), weight.reshape([1, i, o]), bias, act).reshape([a, b, o])
+}
+
+/// The normalisation of `x` over its last axis.
+pub(crate) fn normalise(norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+    layer_norm(x, norm.gamma.val(), norm.beta.as_ref().expect("every normalisation here has one").val())
+}
+
+/// The two layers with a ReLU in between.
+pub(crate) fn feed_forward(layers: &PositionWiseFeedForward, x: Tensor<3>) -> Tensor<3> {
+    affine(&layers.linear_outer, affine(&layers.linear_inner, x, Activation::Relu), Activation::Identity)
+}
+
+/// Attention of `query` `[B, Q, E]` to `keys` `[B, S, E]`, the values' layer included; `mask` `[B, 1, Q, S]` is true where
+/// there is none. `drop` is done to the weights.
+pub(crate) fn attention(
+    layers: &MultiHeadAttention,
+    query: Tensor<3>,
+    keys: Tensor<3>,
+    mask: Tensor<4, Bool>,
+    drop: impl FnOnce(Tensor<4>) -> Tensor<4>,
+) -> Tensor<3> {
+    let [batch, rows, width] = query.dims();
+    let heads = |layer: &Linear, x: Tensor<3>| {
+        let [batch, length, _] = x.dims();
+        let y = affine(layer, x, Activation::Identity);
+        y.reshape([batch, length, layers.n_heads, layers.d_k]).swap_dims(1, 2)
+    };
+    let (q, k, v) = (heads(&layers.query, query), heads(&layers.key, keys.clone()), heads(&layers.value, keys));
+    let scores = q.matmul(k.transpose()) / (layers.d_k as f64).sqrt();
+    let weights = drop(softmax(scores.mask_fill(mask, layers.min_float), 3));
+    let seen = weights.matmul(v).swap_dims(1, 2).reshape([batch, rows, width]);
+    affine(&layers.output, seen, Activation::Identity)
 }
 
 #[cfg(test)]
@@ -120,6 +172,37 @@ mod tests {
         assert_eq!(y, draw(3));
         assert_ne!(y, draw(4));
         assert_eq!(host(Dropout::new(0.0, Streams::new(1).stream("d")).apply(x.clone())), host(x));
+    }
+
+    /// Against the forward passes of burn's modules.
+    #[test]
+    fn fused_passes_follow_the_modules() {
+        use tce_nn::burn::nn::activation::ActivationConfig;
+        use tce_nn::burn::nn::attention::{MhaInput, MultiHeadAttentionConfig, generate_autoregressive_mask};
+        use tce_nn::burn::nn::{LayerNormConfig, transformer::PositionWiseFeedForwardConfig};
+        let device = cpu();
+        let normal = |_: &str| Start::Normal(0.3);
+        let streams = Streams::new(2);
+        let config = MultiHeadAttentionConfig::new(12, 3).with_dropout(0.0);
+        let mha = initialise(config.init(&device), "mha", streams, normal);
+        let config = PositionWiseFeedForwardConfig::new(12, 20).with_dropout(0.0);
+        let config = config.with_activation(ActivationConfig::Relu);
+        let pair = initialise(config.init(&device), "pair", streams, normal);
+        let norm = initialise(LayerNormConfig::new(12).init(&device), "norm", streams, normal);
+        let mut values = vec![0.0; 2 * 5 * 12];
+        fill_normal(&mut streams.stream("x"), &mut values);
+        let x = tce_nn::tensor(values, [2, 5, 12], &device);
+        let mask = generate_autoregressive_mask(2, 5, &device);
+        let own = attention(&mha, x.clone(), x.clone(), mask.clone().reshape([2, 1, 5, 5]), |w| w);
+        let input = MhaInput::self_attn(x.clone()).mask_attn(mask);
+        for (fused, module) in [
+            (own, mha.forward(input).context),
+            (feed_forward(&pair, x.clone()), pair.forward(x.clone())),
+            (normalise(&norm, x.clone()), norm.forward(x)),
+        ] {
+            let far = host(fused).iter().zip(host(module)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(far < 1e-5, "{far}");
+        }
     }
 
     #[test]

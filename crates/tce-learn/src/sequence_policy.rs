@@ -19,6 +19,7 @@ use tce_nn::burn::tensor::{Int, Tensor, TensorData};
 use tce_nn::{Module, NamedParameters, cpu, host, tensor};
 
 use crate::error::LearnError;
+use crate::networks::Dropout;
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
 use crate::world_model::{ContextEncoder, EncoderSizes};
 
@@ -56,7 +57,7 @@ impl SequenceSpec {
     /// What is wrong with it: field, found, expected. `numbers` are those a file holds.
     fn fault(&self, numbers: usize) -> Option<(&'static str, String, String)> {
         let (n, e, t) = (self.observations, &self.encoder, &self.transformer);
-        let sizes = [self.context, e.horizon, e.features, e.hidden, t.embed, t.heads, t.timesteps];
+        let sizes = [self.context, e.horizon, e.features, e.hidden, t.embed, t.layers, t.heads, t.timesteps];
         if self.actions == 0 || self.inputs.is_empty() || sizes.contains(&0) || e.latent == 0 || t.features == 0 {
             return Some(("sizes", format!("{e:?}, {t:?}, context {}", self.context), "all above 0".into()));
         }
@@ -121,6 +122,12 @@ struct Past {
 }
 
 impl Recall {
+    /// Replaces the newest step's action.
+    #[cfg(test)]
+    pub(crate) fn act(&mut self, action: &[f32]) {
+        self.steps.back_mut().expect("a step").action.copy_from_slice(action);
+    }
+
     /// Takes the reward of the newest step.
     pub(crate) fn reward(&mut self, reward: f64) {
         self.return_to_go -= reward;
@@ -162,6 +169,13 @@ impl SequencePolicy {
         &self.spec
     }
 
+    /// The same, asked for another return.
+    #[cfg(test)]
+    pub(crate) fn asked(&mut self, first_return: f64) -> &Self {
+        self.spec.first_return = first_return;
+        self
+    }
+
     pub(crate) fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
         let text = parameters.metadata.get(KEY).map_or("", String::as_str);
         let spec = serde_json::from_str(text).map_err(|e| LearnError::Policy {
@@ -195,7 +209,7 @@ impl SequencePolicy {
             return;
         }
         self.see(observations, memories);
-        let out = host(self.networks.transformer.forward(self.recent(memories), None));
+        let out = host(self.networks.transformer.forward(self.recent(memories), &mut Dropout::none()));
         let per_row = spec.context * spec.actions;
         for ((memory, action), out) in
             memories.iter_mut().zip(actions.chunks_exact_mut(spec.actions)).zip(out.chunks_exact(per_row))
@@ -223,11 +237,11 @@ impl SequencePolicy {
                 strip[2][at] = step.reward;
             }
         }
-        let [s, a_before, r] = strip.map(|v| {
+        let strip = strip.map(|v| {
             let width = v.len() / (rows * h);
             tensor(v, [rows, h, width], &cpu())
         });
-        let contexts = host(self.networks.encoder.contexts(s, a_before, r));
+        let contexts = host(self.networks.encoder.contexts(strip));
         let z = &spec.standardizer;
         let seen = observations.chunks_exact(spec.observations).zip(contexts.chunks_exact(spec.encoder.latent));
         for (memory, (row, context)) in memories.iter_mut().zip(seen) {

@@ -75,7 +75,27 @@ impl Trajectories {
         self.tables.first().map_or(0.0, |t| t.best_return)
     }
 
-    /// The `batch` segments of `step`, each of up to `context` steps, with strips for `horizon` steps of history.
+    /// Rows of each table.
+    pub(crate) fn rows(&self) -> impl Iterator<Item = usize> {
+        self.tables.iter().map(|t| t.rows.len())
+    }
+
+    /// The segments of one step that end at the rows `range` of table `part`, with strips for `horizon` steps of history.
+    pub(crate) fn block(
+        &self,
+        buffer: &Buffer,
+        member: usize,
+        part: usize,
+        range: std::ops::Range<usize>,
+        horizon: usize,
+    ) -> Segments {
+        let mut out = Segments::default();
+        range.for_each(|row| self.tables[part].push(buffer, member, row, [1, horizon], &mut out));
+        out
+    }
+
+    /// The `batch` segments of `step`, each of up to `context` steps, with strips for `horizon` steps of history (none: no
+    /// strips).
     ///
     /// `member` is the number in `buffer` of the member whose trajectories these are.
     pub fn sample(&self, buffer: &Buffer, member: usize, step: u64, [batch, context, horizon]: [usize; 3]) -> Segments {
@@ -135,7 +155,7 @@ impl Table {
                 out.times.push(0);
             }
         }
-        for k in 0..horizon + context - 1 {
+        for k in 0..if horizon > 0 { horizon + context - 1 } else { 0 } {
             // Step start - horizon + k; the drawn row itself is nobody's history.
             match (start + k).checked_sub(horizon).filter(|i| (first..row).contains(i)) {
                 Some(i) => {

@@ -10,22 +10,19 @@
 //! Attention is causal: an action comes of what lies before it in the order above. Two short cuts change no output: the action of the
 //! last step is no token, because nothing comes after it, and the last block computes the tokens of the states alone.
 //!
-//! GPT-2 also drops attention weights. burn's attention does that with its own generator, which does not repeat itself, so
-//! that it is left out here; the three other places have masks from the member's streams.
+//! Dropout is GPT-2's: of the tokens, of attention weights, and of what a block adds. Its masks come from the member's streams.
 
 use tce_base::Streams;
 use tce_nn::burn::nn::activation::ActivationConfig;
-use tce_nn::burn::nn::attention::{
-    MhaInput, MultiHeadAttention, MultiHeadAttentionConfig, generate_autoregressive_mask,
-};
+use tce_nn::burn::nn::attention::{MultiHeadAttention, MultiHeadAttentionConfig, generate_autoregressive_mask};
 use tce_nn::burn::nn::transformer::{PositionWiseFeedForward, PositionWiseFeedForwardConfig};
 use tce_nn::burn::nn::{Embedding, EmbeddingConfig, Initializer, LayerNorm, LayerNormConfig, Linear};
 use tce_nn::burn::tensor::Int;
-use tce_nn::{Device, Module, Tensor};
+use tce_nn::{Activation, Device, Module, Tensor};
 
 use serde::{Deserialize, Serialize};
 
-use crate::networks::{Dropout, Start, initialise};
+use crate::networks::{Dropout, Start, affine, attention, feed_forward, initialise, normalise};
 use crate::world_model::linear;
 
 /// Standard deviation of a block's first weights (GPT-2's).
@@ -140,45 +137,123 @@ pub struct TransformerInput {
 }
 
 impl DecisionTransformer {
-    /// The action of every step, `[B, K, A]`.
-    pub(crate) fn forward(&self, steps: TransformerInput, mut dropout: Option<&mut Dropout>) -> Tensor<3> {
-        let mut drop = |x: Tensor<3>| match dropout.as_mut() {
-            Some(dropout) => dropout.apply(x),
-            None => x,
-        };
-        let [batch, k, _] = steps.states.dims();
-        let time = self.embed_time.forward(steps.times);
-        let state = Tensor::cat(vec![self.features.forward(steps.states), steps.contexts], 2);
+    /// The action of every step, `[B, K, A]`; with `dropout` as in training.
+    pub(crate) fn forward(&self, input: TransformerInput, dropout: &mut Dropout) -> Tensor<3> {
+        let [batch, k, _] = input.states.dims();
+        let time = self.embed_time.forward(input.times);
+        let token = |layer: &Linear, x: Tensor<3>| affine(layer, x, Activation::Identity);
+        let state = Tensor::cat(vec![token(&self.features, input.states), input.contexts], 2);
         let tokens = [
-            self.embed_return.forward(steps.returns),
-            self.embed_state.forward(state),
-            self.embed_action.forward(steps.actions),
+            token(&self.embed_return, input.returns),
+            token(&self.embed_state, state),
+            token(&self.embed_action, input.actions),
         ];
         let tokens = tokens.map(|t| t + time.clone()).to_vec();
         let width = tokens[0].dims()[2];
         let length = 3 * k - 1;
         let x = Tensor::stack::<4>(tokens, 2).reshape([batch, 3 * k, width]).narrow(1, 0, length);
-        let mut x = drop(self.norm_in.forward(x));
-        let device = x.device();
-        let states = Tensor::<1, Int>::arange_step(1..length as i64, 3, &device);
-        let mask = generate_autoregressive_mask(batch, length, &device);
-        let state_mask = mask.clone().select(1, states.clone());
+        let mut x = dropout.apply(normalise(&self.norm_in, x));
+        let states = Tensor::<1, Int>::arange_step(1..length as i64, 3, &x.device());
+        let mask = generate_autoregressive_mask(batch, length, &x.device()).reshape([batch, 1, length, length]);
         for (index, block) in self.blocks.iter().enumerate() {
-            let y = block.norm_1.forward(x.clone());
-            let (query, mask) = match index + 1 == self.blocks.len() {
-                true => {
-                    x = x.select(1, states.clone());
-                    (y.clone().select(1, states.clone()), state_mask.clone())
+            let keys = normalise(&block.norm_1, x.clone());
+            let (mut query, mut mask) = (keys.clone(), mask.clone());
+            if index + 1 == self.blocks.len() {
+                x = x.select(1, states.clone());
+                query = query.select(1, states.clone());
+                mask = mask.select(2, states.clone());
+            }
+            let seen = attention(&block.attention, query, keys, mask, |w| dropout.apply(w));
+            x = x + dropout.apply(seen);
+            let more = feed_forward(&block.feed_forward, normalise(&block.norm_2, x.clone()));
+            x = x + dropout.apply(more);
+        }
+        affine(&self.head, normalise(&self.norm_out, x), Activation::Tanh)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_base::random::fill_normal;
+    use tce_nn::burn::tensor::TensorData;
+    use tce_nn::{NamedParameters, cpu, host, tensor};
+
+    const K: usize = 4;
+
+    fn sizes() -> TransformerSizes {
+        TransformerSizes {
+            inputs: 3,
+            actions: 2,
+            latent: 4,
+            features: 5,
+            embed: 12,
+            layers: 3,
+            heads: 2,
+            timesteps: 10,
+        }
+    }
+
+    /// Two segments; `change` alters the numbers (R̂, s, z, a) of the first.
+    fn forward(net: &DecisionTransformer, change: impl Fn(&mut [Vec<f32>; 4])) -> Vec<f32> {
+        let mut all = [1, 3, 4, 2].map(|width| {
+            let mut values = vec![0.0; 2 * K * width];
+            fill_normal(&mut Streams::new(6).indexed("tokens", width as u64), &mut values);
+            values
+        });
+        change(&mut all);
+        let [returns, states, contexts, actions] = all.map(|v| {
+            let width = v.len() / (2 * K);
+            tensor(v, [2, K, width], &cpu())
+        });
+        let times = TensorData::new((0..2 * K as i32).collect::<Vec<_>>(), [2, K]);
+        let times = Tensor::<2, Int>::from_data(times, &cpu());
+        host(net.forward(TransformerInput { returns, states, contexts, actions, times }, &mut Dropout::none()))
+    }
+
+    /// π at a step changes with R̂, s and z of that step and with everything before, and with nothing that comes after.
+    #[test]
+    fn an_action_comes_of_what_lies_before_it() {
+        let net = sizes().init(Streams::new(1), &cpu());
+        let plain = forward(&net, |_| {});
+        assert_eq!(plain.len(), 2 * K * 2);
+        for step in 0..K {
+            for (kind, width) in [1, 3, 4, 2].into_iter().enumerate() {
+                let changed = forward(&net, |all| all[kind][step * width] += 3.0);
+                // An action is seen from the next step on.
+                let first = if kind == 3 { step + 1 } else { step };
+                assert_eq!(plain[..2 * first], changed[..2 * first], "kind {kind}, step {step}: looked ahead");
+                assert_eq!(plain[2 * K..], changed[2 * K..], "another segment changed");
+                for seen in first..K {
+                    assert_ne!(plain[2 * seen..][..2], changed[2 * seen..][..2], "kind {kind}, step {step}: not seen");
                 }
-                false => (y.clone(), mask.clone()),
+            }
+        }
+    }
+
+    #[test]
+    fn there_are_as_many_numbers_as_promised() {
+        let mut weights = NamedParameters::default();
+        weights.collect("t", &sizes().init(Streams::new(1), &cpu()));
+        assert_eq!(weights.tensors.values().map(|t| t.1.len()).sum::<usize>() as f64, sizes().parameters());
+    }
+
+    /// Every mask is used, and the same stream gives the same masks.
+    #[test]
+    fn training_drops_and_repeats_itself() {
+        let net = sizes().init(Streams::new(1), &cpu());
+        let zeros = |width| Tensor::<3>::ones([2, K, width], &cpu());
+        let run = |index| {
+            let input = TransformerInput {
+                returns: zeros(1),
+                states: zeros(3),
+                contexts: zeros(4),
+                actions: zeros(2),
+                times: Tensor::<2, Int>::zeros([2, K], &cpu()),
             };
-            let input = MhaInput::new(query, y.clone(), y).mask_attn(mask);
-            x = x + drop(block.attention.forward(input).context);
-            x = x.clone() + drop(block.feed_forward.forward(block.norm_2.forward(x)));
-        }
-        if self.blocks.is_empty() {
-            x = x.select(1, states);
-        }
-        self.head.forward(self.norm_out.forward(x)).tanh()
+            host(net.forward(input, &mut Dropout::new(0.3, Streams::new(2).indexed("dropout", index))))
+        };
+        assert_eq!(run(0), run(0));
+        assert_ne!(run(0), run(1));
     }
 }

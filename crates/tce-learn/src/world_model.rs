@@ -9,15 +9,19 @@
 //!
 //! z_t is made of what lies before t, so that it is known when a_t is chosen. Steps before an episode's beginning are zeros.
 
+use std::collections::BTreeSet;
+
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::nn::{Initializer, Linear, LinearConfig, gru::Gru, gru::GruConfig};
 use tce_nn::burn::tensor::activation::relu;
-use tce_nn::{Device, Module, Tensor, tensor};
+use tce_nn::{Device, Module, Tensor, host, tensor};
 
+use crate::buffer::{Buffer, Pick};
 use crate::error::{LearnError, within};
 use crate::networks::{Start, initialise};
-use crate::sequences::Segments;
+use crate::sequences::{Segments, Trajectories};
 
 /// The sizes of a [`ContextEncoder`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -82,7 +86,7 @@ pub struct ContextEncoder {
 
 impl ContextEncoder {
     /// z of every step of segments: strips `[B, h + K - 1, ·]` of states, actions and rewards → `[B, K, Z]`.
-    pub fn contexts(&self, states: Tensor<3>, actions: Tensor<3>, rewards: Tensor<3>) -> Tensor<3> {
+    pub fn contexts(&self, [states, actions, rewards]: [Tensor<3>; 3]) -> Tensor<3> {
         let [batch, strip, _] = states.dims();
         let h = self.horizon;
         let steps = strip + 1 - h;
@@ -116,9 +120,9 @@ impl WorldModel {
         (run(&self.next_state), run(&self.reward))
     }
 
-    /// The two terms of L, `[1]` each, of segments of one step.
-    pub fn losses(&self, batch: &SegmentTensors) -> [Tensor<1>; 2] {
-        let z = batch.contexts(&self.encoder);
+    /// The two terms of L, `[1]` each, of segments of one step and their strips.
+    pub fn losses(&self, batch: &SegmentTensors, strip: [Tensor<3>; 3]) -> [Tensor<1>; 2] {
+        let z = self.encoder.contexts(strip);
         let (next_state, reward) = self.predict(batch.s.clone(), batch.a.clone(), z);
         [(next_state - batch.s2.clone()).square().mean(), (reward - batch.r.clone()).square().mean()]
     }
@@ -220,28 +224,102 @@ pub struct SegmentTensors {
     pub r: Tensor<3>,
     /// s'
     pub s2: Tensor<3>,
-    strip: [Tensor<3>; 3],
 }
 
 impl SegmentTensors {
-    /// `segments` of `batch` rows, with `steps` steps each.
-    pub fn new(segments: &Segments, batch: usize, steps: usize, device: &Device) -> Self {
-        let on_device = |v: &[f32], rows: usize| tensor(v.to_vec(), [batch, rows, v.len() / (batch * rows)], device);
-        let strip = segments.strip_rewards.len() / batch;
+    /// `segments` of `steps` steps each.
+    pub fn new(segments: &Segments, steps: usize, device: &Device) -> Self {
+        let batch = segments.rewards.len() / steps;
+        let on_device = |v: &[f32]| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device);
         Self {
-            s: on_device(&segments.states, steps),
-            a: on_device(&segments.actions, steps),
-            r: on_device(&segments.rewards, steps),
-            s2: on_device(&segments.next_states, steps),
-            strip: [&segments.strip_states, &segments.strip_actions, &segments.strip_rewards]
-                .map(|v| on_device(v, strip)),
+            s: on_device(&segments.states),
+            a: on_device(&segments.actions),
+            r: on_device(&segments.rewards),
+            s2: on_device(&segments.next_states),
         }
     }
+}
 
-    /// z of every step, `[B, K, Z]`.
-    pub fn contexts(&self, encoder: &ContextEncoder) -> Tensor<3> {
-        let [s, a, r] = self.strip.clone();
-        encoder.contexts(s, a, r)
+/// The strips of `batch` segments on the device: states, actions, rewards.
+pub fn strip(segments: &Segments, batch: usize, device: &Device) -> [Tensor<3>; 3] {
+    let steps = segments.strip_rewards.len() / batch;
+    [&segments.strip_states, &segments.strip_actions, &segments.strip_rewards]
+        .map(|v| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device))
+}
+
+/// Whose rows are meant, and where they are computed with.
+#[derive(Clone, Copy)]
+pub(crate) struct Place<'a> {
+    pub buffer: &'a Buffer,
+    pub member: usize,
+    pub device: &'a Device,
+}
+
+/// z of the rows of a member's tables, under a world model that does not change any more: each is needed again and again.
+///
+/// They are computed when first asked for, in blocks that are always the same, so that a training that was resumed gets the
+/// same bits: a product of matrices may round a row differently among other rows.
+#[derive(Clone, Debug)]
+pub(crate) struct Contexts {
+    latent: usize,
+    tables: Vec<TableContexts>,
+}
+
+#[derive(Clone, Debug)]
+struct TableContexts {
+    values: Vec<f32>,
+    /// Whether a block has been computed.
+    known: Vec<bool>,
+}
+
+/// Rows of a block: few, because the segments of a training's first steps touch as many blocks as they have rows.
+const BLOCK: usize = 64;
+
+impl Contexts {
+    /// None known yet.
+    pub(crate) fn new(trajectories: &Trajectories, latent: usize) -> Self {
+        let table =
+            |rows: usize| TableContexts { values: vec![0.0; rows * latent], known: vec![false; rows.div_ceil(BLOCK)] };
+        Self { latent, tables: trajectories.rows().map(table).collect() }
+    }
+
+    /// z of the steps of `segments`, `[B, K, Z]` row-major; behind the last step zeros.
+    pub(crate) fn of(
+        &mut self,
+        segments: &Segments,
+        steps: usize,
+        encoder: &ContextEncoder,
+        trajectories: &Trajectories,
+        Place { buffer, member, device }: Place,
+    ) -> Vec<f32> {
+        let rows = |(pick, valid): (&Pick, &[f32])| {
+            let length = valid.iter().filter(|v| **v > 0.0).count();
+            (pick.part as usize, pick.row as usize + 1 - length..pick.row as usize + 1)
+        };
+        let rows: Vec<_> = segments.picks.iter().zip(segments.valid.chunks_exact(steps)).map(rows).collect();
+        let blocks = rows.iter().flat_map(|(part, r)| (r.start / BLOCK..=(r.end - 1) / BLOCK).map(|b| (*part, b)));
+        let missing: BTreeSet<_> = blocks.filter(|&(part, b)| !self.tables[part].known[b]).collect();
+        let computed: Vec<_> = missing
+            .into_par_iter()
+            .map(|(part, block)| {
+                let end = self.tables[part].values.len() / self.latent;
+                let range = block * BLOCK..end.min((block + 1) * BLOCK);
+                let size = range.len();
+                let segments = trajectories.block(buffer, member, part, range, encoder.horizon);
+                (part, block, host(encoder.contexts(strip(&segments, size, device))))
+            })
+            .collect();
+        for (part, block, values) in computed {
+            let table = &mut self.tables[part];
+            table.values[block * BLOCK * self.latent..][..values.len()].copy_from_slice(&values);
+            table.known[block] = true;
+        }
+        let mut out = Vec::with_capacity(rows.len() * steps * self.latent);
+        for (k, (part, rows)) in rows.into_iter().enumerate() {
+            out.extend_from_slice(&self.tables[part].values[rows.start * self.latent..rows.end * self.latent]);
+            out.resize((k + 1) * steps * self.latent, 0.0);
+        }
+        out
     }
 }
 
@@ -249,7 +327,7 @@ impl SegmentTensors {
 mod tests {
     use super::*;
     use tce_base::random::fill_normal;
-    use tce_nn::{NamedParameters, cpu, host};
+    use tce_nn::{NamedParameters, cpu};
 
     fn sizes() -> EncoderSizes {
         EncoderSizes { inputs: 3, actions: 2, features: 4, hidden: 5, latent: 6, horizon: 3 }
@@ -269,7 +347,7 @@ mod tests {
         let (s, a, r) = (noise([2, strip, 3], "s"), noise([2, strip, 2], "a"), noise([2, strip, 1], "r"));
         let run = |s: &[f32], r: &[f32]| {
             let on = |v: &[f32], d: usize| tensor(v.to_vec(), [2, strip, d], &cpu());
-            encoder.contexts(on(s, 3), on(&a, 2), on(r, 1))
+            encoder.contexts([on(s, 3), on(&a, 2), on(r, 1)])
         };
         let z = run(&s, &r);
         assert_eq!(z.dims(), [2, 2, 6]);

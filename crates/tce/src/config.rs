@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use tce_data::ScoreTable;
 use tce_diffusion::{Process, Sampler, Schedule, Target};
-use tce_learn::{BcConfig, IqlConfig, LabelConfig, RegulariserConfig, RegulariserKind};
+use tce_learn::{BcConfig, IqlConfig, LabelConfig, MetaDt, MetaDtConfig, RegulariserConfig, RegulariserKind};
 
 use crate::error::{Error, Result};
 
@@ -115,6 +115,9 @@ pub enum Algorithm {
     Bc,
     /// Implicit Q-learning.
     Iql,
+    /// A decision transformer on contexts of a world model.
+    #[serde(rename = "meta-dt")]
+    MetaDt,
 }
 
 /// The learner; the keys of the other algorithm are not looked at.
@@ -129,13 +132,22 @@ pub struct LearnerConfig {
     pub top: f64,
     pub iql: IqlConfig,
     pub bc: BcConfig,
+    pub meta_dt: MetaDtConfig,
     pub behaviour: RegulariserConfig,
 }
 
 impl LearnerConfig {
+    /// Steps of the whole training: `steps` of the policy, and before them those of a model that it needs.
+    pub fn updates(&self) -> u64 {
+        match self.algorithm {
+            Algorithm::MetaDt => MetaDt::updates(&self.meta_dt, self.steps),
+            Algorithm::Bc | Algorithm::Iql => self.steps,
+        }
+    }
+
     /// The keys that the algorithm looks at: what a run's identity depends on.
     pub fn used(&self) -> serde_json::Value {
-        let Self { algorithm, steps, batch, standardise, top, iql, bc, behaviour } = self;
+        let Self { algorithm, steps, batch, standardise, top, iql, bc, meta_dt, behaviour } = self;
         let mut used = serde_json::json!({
             "algorithm": algorithm, "steps": steps, "batch": batch, "standardise": standardise,
         });
@@ -150,6 +162,7 @@ impl LearnerConfig {
                     used["behaviour"] = serde_json::json!(behaviour);
                 }
             }
+            Algorithm::MetaDt => used["meta_dt"] = serde_json::json!(meta_dt),
         }
         used
     }
@@ -195,6 +208,7 @@ impl Config {
         }
         self.generator.process.check().map_err(|e| Error::Usage(format!("generator.process: {e}")))?;
         self.generator.sampler.check().map_err(|e| Error::Usage(format!("generator.sampler: {e}")))?;
+        self.learner.meta_dt.check().map_err(|e| Error::Usage(format!("learner.meta_dt: {e}")))?;
         self.learner.iql.check().map_err(|e| Error::Usage(format!("learner.iql: {e}")))
     }
 

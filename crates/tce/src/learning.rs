@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::{
-    Bc, Buffer, Iql, Lane, Member, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
+    Bc, Buffer, Iql, Lane, Member, MetaDt, Policy, PolicyLearner, Regulariser, RewardScale, Steps, best_trajectories,
     return_range_scale, train_side_by_side,
 };
 use tce_nn::{Checkpoints, Device, is_cpu};
@@ -81,10 +81,11 @@ pub fn learn(
     let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
     let mut lanes: Vec<_> =
         learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
-    let steps = Steps::new(config.steps, (config.steps / 50).max(1));
+    let updates = config.updates();
+    let steps = Steps::new(updates, (updates / 50).max(1));
     let label = format!("learn {} {seeds:?}", label(config.algorithm));
     let mut learned = Learned::default();
-    let due = |step: u64| step < config.steps && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
+    let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = Checkpoints::open(place.directory, "learner", place.key)?;
     let from = checkpoints.step().unwrap_or(0);
     let metrics = &mut Metrics::resume(place.directory, |_, at| at <= from)?;
@@ -120,7 +121,7 @@ pub fn learn(
     if let Some(arena) = arena {
         learned.evaluations = judge(&policies, &seeds, evaluation.episodes, arena)?;
         for (m, e) in learned.evaluations.iter().enumerate() {
-            metrics.log("evaluate", config.steps, m, e.score.map(|s| ("score", s)))?;
+            metrics.log("evaluate", updates, m, e.score.map(|s| ("score", s)))?;
         }
     }
     learned.seconds = started.elapsed().as_secs_f64();
@@ -139,6 +140,7 @@ fn lane(data: &[MemberData], config: &LearnerConfig, device: &Device) -> Result<
             let regulariser = regulariser.ok_or(Error::Interrupted)?;
             Box::new(Iql::new(&buffer, &config.iql, regulariser, config.steps, device)?)
         }
+        Algorithm::MetaDt => Box::new(MetaDt::new(&buffer, &config.meta_dt, device)?),
     };
     Ok((buffer, learner))
 }
@@ -147,6 +149,7 @@ fn label(algorithm: Algorithm) -> &'static str {
     match algorithm {
         Algorithm::Bc => "bc",
         Algorithm::Iql => "iql",
+        Algorithm::MetaDt => "meta-dt",
     }
 }
 
