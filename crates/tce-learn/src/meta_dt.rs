@@ -13,7 +13,7 @@
 //! |---|---|---|---|
 //! | K | `context` | 8 | Meta-DT |
 //! | - | `embed`, `layers`, `heads` | 128, 3, 1; ReLU | Meta-DT |
-//! | - | `dropout` | .1 | Meta-DT; not on attention weights, see [`crate::transformer`] |
+//! | - | `dropout` | .1 | Meta-DT; GPT-2's places, see [`crate::transformer`] |
 //! | - | `timesteps` | 1000 | episodes of MuJoCo; DT's embedding of t |
 //! | - | `lr`, `weight_decay` | 5e-5, 1e-4: AdamW | Meta-DT |
 //! | - | `warm_up` | 10 000 steps, linear | Meta-DT |
@@ -39,7 +39,7 @@ use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::networks::Dropout;
 use crate::policy::Policy;
-use crate::sequence_policy::{SequencePolicy, SequenceSpec};
+use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
 use crate::sequences::{Segments, Trajectories};
 use crate::training::{Learner, Meter, PolicyLearner};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
@@ -106,13 +106,10 @@ impl MetaDtConfig {
     /// # Errors
     /// Names the field.
     pub fn check(&self) -> Result<(), LearnError> {
-        for (field, value) in [
-            ("context", self.context),
-            ("embed", self.embed),
-            ("layers", self.layers),
-            ("heads", self.heads),
-            ("batch", self.batch),
-        ] {
+        within("context", self.context as f64, 1.0..=MAX_CONTEXT as f64)?;
+        for (field, value) in
+            [("embed", self.embed), ("layers", self.layers), ("heads", self.heads), ("batch", self.batch)]
+        {
             within(field, value as f64, 1.0..=65536.0)?;
         }
         within("timesteps", self.timesteps as f64, 1.0..=1e7)?;
@@ -122,7 +119,7 @@ impl MetaDtConfig {
         within("grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
         within("return_scale", self.return_scale, f64::MIN_POSITIVE..=1e12)?;
         within("return_factor", self.return_factor, -1e6..=1e6)?;
-        if self.embed % self.heads != 0 {
+        if !self.embed.is_multiple_of(self.heads) {
             let expected = format!("a divisor of embed = {}", self.embed);
             return Err(LearnError::invalid("heads", self.heads, expected, "correct the configuration"));
         }
@@ -348,7 +345,7 @@ mod tests {
     fn the_loss_is_that_of_the_policy_that_acts() {
         let (mut learner, t) = learner();
         let mut policy = learner.policies().remove(0);
-        let mut errors = vec![0.0; t.len()];
+        let mut errors = Vec::new();
         for episode in t.episodes() {
             let Policy::Sequence(sequence) = &mut policy else { panic!("a policy with a memory") };
             // What the data got in this episode is what the policy is asked for.
@@ -356,7 +353,7 @@ mod tests {
             let mut a = [0.0; 2];
             for i in episode.start..episode.end {
                 sequence.act(t.observation(i), &mut [&mut memory], &mut a);
-                errors[i] = a.iter().zip(t.action(i)).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+                errors.push(a.iter().zip(t.action(i)).map(|(a, b)| (a - b).powi(2)).sum::<f32>());
                 // As if it had done what the data did.
                 memory.act(t.action(i));
                 memory.reward(t.rewards[i].into());

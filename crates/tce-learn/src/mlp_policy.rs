@@ -198,7 +198,7 @@ pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -
     let mut all = NamedParameters::default();
     all.collect(KEY, networks);
     let policy = |(m, spec)| MlpPolicy::new(spec, &all.member(m), KEY, Path::new("(in memory)"));
-    let made = |x| Policy::Mlp(policy(x).expect("the networks were made from the specification"));
+    let made = |x| Policy::Mlp(Box::new(policy(x).expect("the networks were made from the specification")));
     specs.into_iter().enumerate().map(made).collect()
 }
 
@@ -228,7 +228,7 @@ mod tests {
         let spec = spec(head);
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
         match from_population(vec![spec], &network).remove(0) {
-            Policy::Mlp(policy) => policy,
+            Policy::Mlp(policy) => *policy,
             other => panic!("{other:?}"),
         }
     }

@@ -2,8 +2,8 @@
 //!
 //! - Initial weights and dropout from named streams: burn draws both from one generator of the whole process, whose numbers
 //!   depend on which thread asks first.
-//! - The fused operations of `tce-nn` on the parameters of burn's modules: the modules' own forward passes are the definition, and
-//!   the oracle in tests; a decision transformer's update takes TIMES as long with them.
+//! - The fused operations of `tce-nn` on the parameters of burn's modules. The modules' own forward passes are the definition and
+//!   the oracle in tests; an update of a decision transformer takes two and a half times as long with them.
 
 use rand::Rng as _;
 use tce_base::random::{fill_normal, fill_uniform};

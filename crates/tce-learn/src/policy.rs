@@ -21,7 +21,7 @@ use crate::sequence_policy::{self, Recall, SequencePolicy};
 #[derive(Clone, Debug)]
 pub enum Policy {
     /// From the observation alone.
-    Mlp(MlpPolicy),
+    Mlp(Box<MlpPolicy>),
     /// From the last steps.
     Sequence(Box<SequencePolicy>),
 }
@@ -49,7 +49,7 @@ impl Policy {
     pub fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
         match parameters.metadata.contains_key(sequence_policy::KEY) {
             true => SequencePolicy::from_parameters(parameters, path).map(|p| Self::Sequence(Box::new(p))),
-            false => MlpPolicy::from_parameters(parameters, path).map(Self::Mlp),
+            false => MlpPolicy::from_parameters(parameters, path).map(|p| Self::Mlp(Box::new(p))),
         }
     }
 

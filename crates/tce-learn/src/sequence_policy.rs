@@ -26,6 +26,9 @@ use crate::world_model::{ContextEncoder, EncoderSizes};
 /// Key of the specification in a policy file's metadata.
 pub(crate) const KEY: &str = "sequence_policy";
 
+/// Greatest K. A file's weights say nothing of K, and attention takes memory for its square.
+pub(crate) const MAX_CONTEXT: usize = 1024;
+
 /// What the parameters' names begin with.
 const PREFIX: &str = "policy";
 
@@ -61,15 +64,15 @@ impl SequenceSpec {
         if self.actions == 0 || self.inputs.is_empty() || sizes.contains(&0) || e.latent == 0 || t.features == 0 {
             return Some(("sizes", format!("{e:?}, {t:?}, context {}", self.context), "all above 0".into()));
         }
-        if self.context > 65536 || e.horizon > 65536 {
+        if self.context > MAX_CONTEXT || e.horizon > 65536 {
             let found = format!("{}, {}", self.context, e.horizon);
-            return Some(("context, horizon", found, "at most 65536".into()));
+            return Some(("context, horizon", found, format!("at most {MAX_CONTEXT} and 65536")));
         }
         if self.inputs.iter().any(|&d| d >= n) {
             return Some(("inputs", format!("{:?}", self.inputs), format!("dimensions below {n}")));
         }
         let widths = [(e.inputs, e.actions, e.latent), (t.inputs, t.actions, t.latent)];
-        if widths != [(self.inputs.len(), self.actions, e.latent); 2] || t.embed % t.heads != 0 {
+        if widths != [(self.inputs.len(), self.actions, e.latent); 2] || !t.embed.is_multiple_of(t.heads) {
             let expected = "the policy's inputs and actions, and a width that the heads share".to_owned();
             return Some(("encoder, transformer", format!("{e:?}, {t:?}"), expected));
         }
