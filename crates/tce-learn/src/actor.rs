@@ -30,7 +30,8 @@ use tce_nn::{
 use crate::buffer::Buffer;
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, normal_log_prob, squared_error};
-use crate::policy::{Head, LOG_STD_RANGE, Policy, PolicySpec, from_population};
+use crate::mlp_policy::{Head, LOG_STD_RANGE, PolicySpec, from_population};
+use crate::policy::Policy;
 use crate::training::member_noise;
 
 /// Range of a state-independent ln σ.

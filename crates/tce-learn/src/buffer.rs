@@ -282,14 +282,15 @@ impl Buffer {
         out
     }
 
-    fn push(&self, member: &Member, row: &[f32], out: &mut Vec<f32>) {
+    /// Appends an observation of `member` as its networks see it.
+    pub(crate) fn push(&self, member: &Member, row: &[f32], out: &mut Vec<f32>) {
         let z = &member.standardizer;
         out.extend(self.inputs.iter().map(|&d| (row[d] - z.mean[d]) / z.std[d]));
     }
 }
 
 /// `batch` rows over the parts that have any, evenly; what is left over goes to the earlier parts.
-fn split(batch: usize, parts: &[Arc<Transitions>]) -> Vec<usize> {
+pub(crate) fn split(batch: usize, parts: &[Arc<Transitions>]) -> Vec<usize> {
     let live = parts.iter().filter(|p| !p.is_empty()).count();
     let mut given = 0;
     let share = |p: &Arc<Transitions>| {

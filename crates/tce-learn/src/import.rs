@@ -22,7 +22,8 @@ use tce_nn::{Activation, NamedParameters};
 use zip::ZipArchive;
 
 use crate::error::LearnError;
-use crate::policy::{Head, Policy, PolicySpec};
+use crate::mlp_policy::{Head, MlpPolicy, PolicySpec};
+use crate::policy::Policy;
 
 const REMEDY: &str = "see the table of kinds in the documentation of tce_learn::import";
 
@@ -92,7 +93,7 @@ pub fn load_npz(path: &Path) -> Result<Policy, LearnError> {
         weights.tensors.insert(format!("policy.layers.{k}.bias"), (vec![1, 1, b.len()], b));
         weights.tensors.insert(format!("policy.layers.{k}.weight"), (vec![1, w.columns, w.rows], w.transposed()));
     }
-    Policy::new(spec, &weights, "policy", path)
+    Ok(Policy::Mlp(Box::new(MlpPolicy::new(spec, &weights, "policy", path)?)))
 }
 
 /// A matrix `[rows, columns]`, row-major.

@@ -12,6 +12,7 @@
 //! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`] |
 //! | choosing among a batch's rows | [`selection`] |
 //! | DmC: scored rows, filtered and weighed | [`dmc`] |
+//! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
 
@@ -31,7 +32,10 @@ pub mod import;
 pub mod iql;
 pub mod labels;
 pub mod losses;
+pub mod meta_dt;
+mod mlp_policy;
 mod mode;
+mod networks;
 pub mod otdf;
 pub mod pair_model;
 mod policy;
@@ -39,9 +43,13 @@ pub mod rebrac;
 pub mod regulariser;
 pub mod sac;
 pub mod selection;
+mod sequence_policy;
+pub mod sequences;
 pub mod srpo;
 pub mod td3_bc;
 mod training;
+pub mod transformer;
+pub mod world_model;
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
@@ -54,11 +62,14 @@ pub use error::LearnError;
 pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, train_labels};
+pub use meta_dt::{MetaDt, MetaDtConfig};
+pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;
 pub use otdf::{Otdf, OtdfConfig};
-pub use policy::{Head, LOG_STD_RANGE, Policy, PolicySpec};
+pub use policy::{Memory, Policy};
 pub use rebrac::{Rebrac, RebracConfig};
 pub use regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
+pub use sequence_policy::{SequencePolicy, SequenceSpec};
 pub use srpo::{Srpo, SrpoConfig};
 pub use td3_bc::{Td3Bc, Td3BcConfig};
 pub use training::{

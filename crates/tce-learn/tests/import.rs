@@ -180,7 +180,8 @@ fn every_shared_policy_loads_and_acts_in_the_box() {
     let mut kinds = [0; 3];
     for path in files.map(|f| f.unwrap().path()).filter(|p| p.extension().is_some_and(|e| e == "npz")) {
         let policy = Policy::load(&path).unwrap_or_else(|e| panic!("{e}"));
-        let spec = policy.spec();
+        let Policy::Mlp(mlp) = &policy else { panic!("{}", path.display()) };
+        let spec = mlp.spec();
         kinds[match spec.head {
             Head::Mean => 0,
             Head::Gaussian { .. } => 1,

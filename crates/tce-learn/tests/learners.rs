@@ -34,7 +34,7 @@ fn run<L: Learner>(learner: &mut L, buffer: &Buffer, steps: u64) -> tce_learn::R
 }
 
 fn action(policy: &Policy, observation: &[f32]) -> Vec<f32> {
-    let mut out = vec![0.0; policy.spec().actions];
+    let mut out = vec![0.0; policy.dims().1];
     policy.act(observation, None, &mut out);
     out
 }

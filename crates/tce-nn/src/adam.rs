@@ -9,18 +9,20 @@
 //! | β₁, β₂ | `beta_1`, `beta_2` | 0.9, 0.999 | PyTorch's defaults, as in every code of the field |
 //! | ε | `epsilon` | 1e-8 | the same |
 //! | λ | `weight_decay` | 0 | decoupled (AdamW), multiplied by lr |
+//! | c | `max_norm` | none | g ← g · min(1, c / (‖g‖ + 1e-6)), ‖g‖ over all parameters, as PyTorch's `clip_grad_norm_` |
 //! | ρ | argument of [`Adam::step_averaged`] | – | the learner's |
 
 use std::collections::VecDeque;
 
 use burn::backend::Flex;
-use burn::module::{Module, ModuleMapper, Param};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor};
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
 use crate::dense::is_flex;
 use crate::params::follow;
+use crate::tensors::host;
 
 /// The constants of [`Adam`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,11 +35,14 @@ pub struct AdamConfig {
     pub epsilon: f64,
     /// Decoupled weight decay.
     pub weight_decay: f64,
+    /// Greatest norm of the gradient of all parameters together; a longer one is shortened. The norm is that of the whole
+    /// module: a population in one module would be clipped as one, so hold one module per member.
+    pub max_norm: Option<f64>,
 }
 
 impl Default for AdamConfig {
     fn default() -> Self {
-        Self { beta_1: 0.9, beta_2: 0.999, epsilon: 1e-8, weight_decay: 0.0 }
+        Self { beta_1: 0.9, beta_2: 0.999, epsilon: 1e-8, weight_decay: 0.0, max_norm: None }
     }
 }
 
@@ -96,6 +101,7 @@ impl Adam {
             step: (lr * (1.0 - c.beta_2.powi(self.time)).sqrt() / (1.0 - c.beta_1.powi(self.time))) as f32,
             epsilon: (c.epsilon * (1.0 - c.beta_2.powi(self.time)).sqrt()) as f32,
             keep: (1.0 - lr * c.weight_decay) as f32,
+            shorten: c.max_norm.map_or(1.0, |max| (max / (gradient_norm(&module, grads) + 1e-6)).min(1.0)) as f32,
         };
         module.map(&mut Stepper { index: 0, moments: &mut self.moments, grads, coefficients, followers })
     }
@@ -118,6 +124,35 @@ struct Coefficients {
     step: f32,
     epsilon: f32,
     keep: f32,
+    /// Factor on the gradient.
+    shorten: f32,
+}
+
+/// ‖g‖ over all parameters of `module` that have a gradient. Added up in double precision and in a fixed order.
+pub(crate) fn gradient_norm<M: Module>(module: &M, grads: &Gradients) -> f64 {
+    struct Norm<'a> {
+        grads: &'a Gradients,
+        squares: f64,
+    }
+    impl ModuleVisitor for Norm<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let Some(g) = param.val().grad(self.grads) else { return };
+            if !is_flex(&g) {
+                self.squares += host(g.square().sum())[0] as f64;
+                return;
+            }
+            let g = g.try_into_primitive::<Flex>().expect("on the CPU and outside of autodiff").to_contiguous();
+            // Sixteen running sums, because one alone waits for itself at every addition.
+            let mut sums = [0.0; 16];
+            for chunk in g.as_slice::<f32>().expect("contiguous").chunks(sums.len()) {
+                sums.iter_mut().zip(chunk).for_each(|(sum, g)| *sum += *g as f64 * *g as f64);
+            }
+            self.squares += sums.iter().sum::<f64>();
+        }
+    }
+    let mut norm = Norm { grads, squares: 0.0 };
+    module.visit(&mut norm);
+    norm.squares.sqrt()
 }
 
 /// The parameters of a moving average, in module order; each goes to the end of the queue when it has moved.
@@ -231,6 +266,7 @@ fn update(state: State, g: Tensor<1>, c: Coefficients) -> State {
 }
 
 fn update_composed(state: State, g: Tensor<1>, c: Coefficients) -> State {
+    let g = g * c.shorten;
     let m = state.m * c.beta_1 + g.clone() * (1.0 - c.beta_1);
     let v = state.v * c.beta_2 + g.square() * (1.0 - c.beta_2);
     let theta = state.theta * c.keep - m.clone() * c.step / (v.clone().sqrt() + c.epsilon);
@@ -263,6 +299,7 @@ fn fused_averaged(
 
 #[inline(always)]
 fn step(theta: &mut f32, g: f32, m: &mut f32, v: &mut f32, c: Coefficients) {
+    let g = g * c.shorten;
     *m = *m * c.beta_1 + g * (1.0 - c.beta_1);
     *v = *v * c.beta_2 + (g * g) * (1.0 - c.beta_2);
     *theta = *theta * c.keep - *m * c.step / (v.sqrt() + c.epsilon);
@@ -293,11 +330,30 @@ mod tests {
         }
     }
 
+    /// Weight decay and clipping, against the formulas in f64: the gradient (6, 8) of length 10 is shortened to length 1.
+    #[test]
+    fn decays_and_clips_as_the_formula_says() {
+        let device = Device::flex().autodiff();
+        let mut layer = Dense::new(&[Streams::new(0)], "x", 1, 2, Activation::Identity, &device);
+        let before = host(layer.weight.val());
+        let config = AdamConfig { weight_decay: 0.1, max_norm: Some(1.0), epsilon: 1e-2, ..AdamConfig::default() };
+        let slopes = Tensor::<3>::from_floats([[[6.0, 8.0]]], &device);
+        let mut grads = (layer.weight.val() * slopes).sum().backward();
+        assert!((gradient_norm(&layer, &grads) - 10.0).abs() < 1e-6);
+        layer = config.init().step(0.5, layer, &mut grads);
+        for ((after, before), g) in host(layer.weight.val()).into_iter().zip(before).zip([0.6, 0.8]) {
+            // At the first step m̂ = g and √v̂ = |g|.
+            let expected = before as f64 * (1.0 - 0.5 * 0.1) - 0.5 * g / (g + 1e-2);
+            assert!((after as f64 - expected).abs() < 1e-5, "{after} {expected}");
+        }
+        assert_eq!(host(layer.bias.val()).len(), 2);
+    }
+
     #[test]
     fn fused_follows_the_composition() {
         let device = Device::flex();
         let vector = |scale: f32| Tensor::<1>::from_floats([0.5, -1.0, 2.0, 1e-3].map(|v: f32| v * scale), &device);
-        let c = Coefficients { beta_1: 0.9, beta_2: 0.999, step: 1e-2, epsilon: 1e-8, keep: 0.99 };
+        let c = Coefficients { beta_1: 0.9, beta_2: 0.999, step: 1e-2, epsilon: 1e-8, keep: 0.99, shorten: 0.5 };
         let start = || (vector(1.0), vector(-0.3), vector(0.1), vector(1.0).abs());
         for average in [false, true] {
             let state = |(theta, _, m, v): (_, Tensor<1>, _, _)| State {

@@ -2,7 +2,7 @@
 //!
 //! Every parameter has the shape `[P, ...]` and every batch `[P, B, D]`: P independent networks (seeds, tasks,
 //! ensembles) are one set of tensors and one training. Tensors, autodiff and modules are burn's; what the CPU does more
-//! than once per step (dense layers, Adam, moving averages, a score network's trunk in sampling) goes through fused operations ([`dense`],
+//! than once per step (dense layers, layer normalisation, Adam, moving averages, a score network's trunk in sampling) goes through fused operations ([`dense`],
 //! [`Adam`], [`ResidualStack`]), of which
 //! the plain composition of burn operations is the definition and the test oracle.
 
@@ -13,6 +13,7 @@ mod dense;
 mod gemm;
 mod kernels;
 mod layers;
+mod norm;
 mod params;
 mod probe;
 mod simd;
@@ -25,6 +26,7 @@ pub use adam::{Adam, AdamConfig};
 pub use checkpoint::{Checkpoints, set_checkpoint_seconds};
 pub use dense::{dense, dense_composed};
 pub use layers::{Dense, LayerNorm, Mlp, MlpConfig};
+pub use norm::{layer_norm, layer_norm_composed};
 pub use params::{NamedParameters, NetworkError, moving_average, parameter_count};
 pub use probe::{instructions, product_rate};
 pub use stack::ResidualStack;

@@ -19,7 +19,12 @@ pub struct Trained<M> {
 impl<M: Module> Trained<M> {
     /// A network that has not seen a step, trained with Adam's default constants.
     pub fn new(net: M) -> Self {
-        Self { net: Some(net), adam: AdamConfig::default().init() }
+        Self::with(net, AdamConfig::default())
+    }
+
+    /// The same, trained with other constants: weight decay, clipped gradients.
+    pub fn with(net: M, config: AdamConfig) -> Self {
+        Self { net: Some(net), adam: config.init() }
     }
 
     /// The network.

@@ -13,14 +13,27 @@ use crate::{SimError, StepResult};
 
 /// Something that chooses actions.
 pub trait Actor: Sync {
+    /// What a lane remembers of its episode; `()` for actors that look at the observation alone.
+    type Memory: Send;
+
+    /// The memory of a lane whose episode begins.
+    fn start(&self) -> Self::Memory;
+
     /// Fills `actions` (`[rows, act_dim]`, row-major, in [-1, 1]) for `observations` (`[rows, obs_dim]`).
-    /// `rngs` holds one generator per row, for actors that sample; a row's numbers must come from its own generator
-    /// only, so that they do not depend on which other rows are in the batch.
-    fn act(&self, observations: &[f32], rngs: &mut [Rng], actions: &mut [f32]);
+    /// `memories` and `rngs` hold one memory and one generator per row, the latter for actors that sample; a row's numbers must
+    /// come from its own of both only, so that they do not depend on which other rows are in the batch.
+    fn act(&self, observations: &[f32], memories: &mut [Self::Memory], rngs: &mut [Rng], actions: &mut [f32]);
+
+    /// Tells a lane's memory the reward of the action that was just taken, if the episode goes on.
+    fn reward(&self, _memory: &mut Self::Memory, _reward: f64) {}
 }
 
 impl<F: Fn(&[f32], &mut [Rng], &mut [f32]) + Sync> Actor for F {
-    fn act(&self, observations: &[f32], rngs: &mut [Rng], actions: &mut [f32]) {
+    type Memory = ();
+
+    fn start(&self) {}
+
+    fn act(&self, observations: &[f32], _: &mut [()], rngs: &mut [Rng], actions: &mut [f32]) {
         self(observations, rngs, actions)
     }
 }
@@ -30,7 +43,11 @@ impl<F: Fn(&[f32], &mut [Rng], &mut [f32]) + Sync> Actor for F {
 pub struct UniformActor;
 
 impl Actor for UniformActor {
-    fn act(&self, _: &[f32], rngs: &mut [Rng], actions: &mut [f32]) {
+    type Memory = ();
+
+    fn start(&self) {}
+
+    fn act(&self, _: &[f32], _: &mut [()], rngs: &mut [Rng], actions: &mut [f32]) {
         let dim = actions.len() / rngs.len().max(1);
         for (rng, row) in rngs.iter_mut().zip(actions.chunks_exact_mut(dim)) {
             tce_base::random::fill_uniform(rng, row);
@@ -75,7 +92,18 @@ pub struct EpisodeResult {
 /// What the two kinds of rollout do with a step.
 trait Lane: Send {
     /// Takes note of a step (s, a, r, s') and says how to go on. `after` is s' and may be overwritten by a reset.
-    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> bool;
+    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> Next;
+}
+
+/// How a lane goes on.
+#[derive(Clone, Copy, PartialEq)]
+enum Next {
+    /// With the episode's next step.
+    Step,
+    /// With a new episode, which `after` is the first observation of.
+    Episode,
+    /// Not at all.
+    Leave,
 }
 
 struct Step<'a> {
@@ -86,17 +114,19 @@ struct Step<'a> {
 }
 
 /// The lanes that still run, row by row: everything an actor needs lies contiguous.
-struct Lockstep<L> {
+struct Lockstep<'a, A: Actor, L> {
     agent: Agent,
+    actor: &'a A,
     lanes: Vec<(Env, L)>,
+    memories: Vec<A::Memory>,
     rngs: Vec<Rng>,
     observations: Vec<f32>,
     next: Vec<f32>,
     actions: Vec<f32>,
 }
 
-impl<L: Lane> Lockstep<L> {
-    fn new(agent: Agent, model: &Arc<MjModel>, starts: impl Iterator<Item = (L, Rng, Rng)>) -> Self {
+impl<'a, A: Actor, L: Lane> Lockstep<'a, A, L> {
+    fn new(agent: Agent, model: &Arc<MjModel>, actor: &'a A, starts: impl Iterator<Item = (L, Rng, Rng)>) -> Self {
         let (obs_dim, act_dim) = agent.dims();
         let mut lanes = Vec::new();
         let mut rngs = Vec::new();
@@ -110,29 +140,46 @@ impl<L: Lane> Lockstep<L> {
             rngs.push(action);
         }
         let rows = lanes.len();
-        Self { agent, lanes, rngs, observations, next: vec![0.0; rows * obs_dim], actions: vec![0.0; rows * act_dim] }
+        Self {
+            agent,
+            actor,
+            lanes,
+            memories: (0..rows).map(|_| actor.start()).collect(),
+            rngs,
+            observations,
+            next: vec![0.0; rows * obs_dim],
+            actions: vec![0.0; rows * act_dim],
+        }
     }
 
     /// One step of every lane. Lanes that are done leave, in their order, into `finished`.
-    fn tick(&mut self, actor: &dyn Actor, finished: &mut Vec<L>) -> Result<(), SimError> {
+    fn tick(&mut self, finished: &mut Vec<L>) -> Result<(), SimError> {
         let (obs_dim, act_dim) = self.agent.dims();
+        let actor = self.actor;
         let rows = self.lanes.len();
         let observations = &mut self.observations[..rows * obs_dim];
         let next = &mut self.next[..rows * obs_dim];
         let actions = &mut self.actions[..rows * act_dim];
-        actor.act(observations, &mut self.rngs, actions);
+        actor.act(observations, &mut self.memories, &mut self.rngs, actions);
         if let Some(at) = actions.iter().position(|a| !a.is_finite()) {
             return Err(SimError::NotFinite { what: "the actor's actions", row: at / act_dim, value: actions[at] });
         }
         let running: Vec<bool> = self
             .lanes
             .par_iter_mut()
-            .zip(self.rngs.par_iter_mut())
+            .zip(self.memories.par_iter_mut().zip(self.rngs.par_iter_mut()))
             .zip(observations.par_chunks_exact_mut(obs_dim).zip(next.par_chunks_exact_mut(obs_dim)))
             .zip(actions.par_chunks_exact(act_dim))
-            .map(|((((env, lane), rng), (before, after)), action)| {
+            .map(|((((env, lane), (memory, rng)), (before, after)), action)| {
                 let result = env.step(action, after);
-                lane.advance(env, Step { before, action, after, result }, rng)
+                let reward = result.reward;
+                let next = lane.advance(env, Step { before, action, after, result }, rng);
+                match next {
+                    Next::Step => actor.reward(memory, reward),
+                    Next::Episode => *memory = actor.start(),
+                    Next::Leave => {}
+                }
+                next != Next::Leave
             })
             .collect();
         std::mem::swap(&mut self.observations, &mut self.next);
@@ -148,6 +195,8 @@ impl<L: Lane> Lockstep<L> {
         }
         let mut flags = running.iter();
         self.rngs.retain(|_| *flags.next().expect("one flag per row"));
+        let mut flags = running.iter();
+        self.memories.retain(|_| *flags.next().expect("one flag per row"));
         let done = self.lanes.extract_if(.., {
             let mut flags = running.iter();
             move |_| !*flags.next().expect("one flag per row")
@@ -175,7 +224,7 @@ impl Collector {
 }
 
 impl Lane for Collector {
-    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> bool {
+    fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> Next {
         let Step { before, action, after, result } = step;
         let mut over = result.unstable;
         if result.unstable {
@@ -192,15 +241,16 @@ impl Lane for Collector {
             over = result.terminal || timeout;
         }
         if self.table.len() == self.quota {
-            return false;
+            return Next::Leave;
         }
-        if over {
-            self.episode += 1;
-            self.steps = 0;
-            env.reset(&mut self.stream("collect/reset"), after);
-            *rng = self.stream("collect/action");
+        if !over {
+            return Next::Step;
         }
-        true
+        self.episode += 1;
+        self.steps = 0;
+        env.reset(&mut self.stream("collect/reset"), after);
+        *rng = self.stream("collect/action");
+        Next::Episode
     }
 }
 
@@ -212,10 +262,10 @@ impl Lane for Collector {
 /// # Errors
 /// If options are out of range, the actor returns a number that is not finite, the physics blow up again and again, or
 /// the user interrupts.
-pub fn collect(
+pub fn collect<A: Actor>(
     agent: Agent,
     shift: Shift,
-    actor: &dyn Actor,
+    actor: &A,
     options: &CollectOptions<'_>,
 ) -> Result<Transitions, SimError> {
     if options.lanes == 0 {
@@ -238,14 +288,14 @@ pub fn collect(
         let (reset, action) = (collector.stream("collect/reset"), collector.stream("collect/action"));
         (collector, reset, action)
     });
-    let mut lockstep = Lockstep::new(agent, &model, starts);
+    let mut lockstep = Lockstep::new(agent, &model, actor, starts);
     let mut finished = Vec::with_capacity(lanes);
     while !lockstep.lanes.is_empty() {
         if interrupted() {
             return Err(SimError::Interrupted);
         }
         let rows = lockstep.lanes.len() as u64;
-        lockstep.tick(actor, &mut finished)?;
+        lockstep.tick(&mut finished)?;
         if let Some(progress) = options.progress {
             progress.inc(rows);
         }
@@ -268,15 +318,15 @@ struct Evaluator {
 }
 
 impl Lane for Evaluator {
-    fn advance(&mut self, _: &mut Env, step: Step<'_>, _: &mut Rng) -> bool {
+    fn advance(&mut self, _: &mut Env, step: Step<'_>, _: &mut Rng) -> Next {
         let result = &mut self.result;
         if step.result.unstable {
             result.unstable = true;
-            return false;
+            return Next::Leave;
         }
         result.episode_return += step.result.reward;
         result.length += 1;
-        !step.result.terminal && result.length < EPISODE_LIMIT
+        if step.result.terminal || result.length == EPISODE_LIMIT { Next::Leave } else { Next::Step }
     }
 }
 
@@ -286,10 +336,10 @@ impl Lane for Evaluator {
 ///
 /// # Errors
 /// If the actor returns a number that is not finite, or `stop` says so.
-pub fn evaluate(
+pub fn evaluate<A: Actor>(
     agent: Agent,
     shift: Shift,
-    actor: &dyn Actor,
+    actor: &A,
     episodes: usize,
     streams: Streams,
     stop: impl Fn() -> bool,
@@ -300,13 +350,13 @@ pub fn evaluate(
         let i = index as u64;
         (Evaluator { index, result }, streams.indexed("evaluate/reset", i), streams.indexed("evaluate/action", i))
     });
-    let mut lockstep = Lockstep::new(agent, &model, starts);
+    let mut lockstep = Lockstep::new(agent, &model, actor, starts);
     let mut finished = Vec::with_capacity(episodes);
     while !lockstep.lanes.is_empty() {
         if stop() {
             return Err(SimError::Interrupted);
         }
-        lockstep.tick(actor, &mut finished)?;
+        lockstep.tick(&mut finished)?;
     }
     finished.sort_by_key(|lane| lane.index);
     Ok(finished.into_iter().map(|lane| lane.result).collect())

@@ -4,7 +4,7 @@ use std::sync::Mutex;
 
 use tce_base::{Rng, Streams};
 use tce_data::{Agent, Shift, Transitions};
-use tce_sim::{CollectOptions, EPISODE_LIMIT, Env, SimError, UniformActor, collect, evaluate, replay};
+use tce_sim::{Actor, CollectOptions, EPISODE_LIMIT, Env, SimError, UniformActor, collect, evaluate, replay};
 
 fn with_threads<R: Send>(threads: usize, work: impl FnOnce() -> R + Send) -> R {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
@@ -152,4 +152,62 @@ fn replay_refuses_another_robots_rows() {
     let data = random(Agent::Hopper, 10, 1, 0);
     let error = replay(Agent::Ant, Shift::Source, &data, None).unwrap_err();
     assert!(matches!(error, SimError::Dimension { found: 11, expected: 111, .. }), "{error}");
+}
+
+/// Acts by how many steps its episode has had, and checks that it was told every reward.
+struct Counting {
+    /// Sum of the rewards before the last step, of every episode that was evaluated, and its steps.
+    told: Mutex<Vec<(usize, f64)>>,
+}
+
+impl Actor for Counting {
+    /// The number of the lane's episode in `told`, if it acted already.
+    type Memory = Option<usize>;
+
+    fn start(&self) -> Option<usize> {
+        None
+    }
+
+    fn act(&self, _: &[f32], memories: &mut [Option<usize>], rngs: &mut [Rng], actions: &mut [f32]) {
+        assert_eq!(memories.len(), rngs.len());
+        let mut told = self.told.lock().unwrap();
+        for (memory, action) in memories.iter_mut().zip(actions.chunks_exact_mut(3)) {
+            let at = *memory.get_or_insert_with(|| {
+                told.push((0, 0.0));
+                told.len() - 1
+            });
+            action.fill(by_steps(told[at].0));
+            told[at].0 += 1;
+        }
+    }
+
+    fn reward(&self, memory: &mut Option<usize>, reward: f64) {
+        self.told.lock().unwrap()[memory.unwrap()].1 += reward;
+    }
+}
+
+fn by_steps(steps: usize) -> f32 {
+    (steps as f32).sin() * 0.5
+}
+
+#[test]
+fn a_memory_lives_as_long_as_its_episode() {
+    let actor = Counting { told: Mutex::default() };
+    let data = collect(Agent::Hopper, Shift::Source, &actor, &CollectOptions::new(400, Streams::new(3))).unwrap();
+    let episodes = data.episodes();
+    assert!(episodes.len() > 32, "several episodes a lane");
+    for episode in &episodes {
+        for row in episode.start..episode.end {
+            assert_eq!(data.action(row), [by_steps(row - episode.start); 3]);
+        }
+    }
+    assert_eq!(actor.told.lock().unwrap().len(), episodes.len());
+
+    let actor = Counting { told: Mutex::default() };
+    let results = evaluate(Agent::Hopper, Shift::Source, &actor, 5, Streams::new(0), || false).unwrap();
+    // Episodes begin in their order; a lane that leaves takes its memory along.
+    for (result, (steps, told)) in results.iter().zip(actor.told.lock().unwrap().iter()) {
+        assert_eq!(result.length, *steps);
+        assert!(*told != 0.0 && (result.episode_return - told).abs() < 20.0, "all rewards but the last");
+    }
 }

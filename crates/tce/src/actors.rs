@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Rng, Streams, move_into_place, sha256_file, sha256_hex};
 use tce_data::{Agent, Quality, ReferenceScores, ScoreTable, Shift, Transitions, reference_scores, save_d4rl};
-use tce_learn::Policy;
+use tce_learn::{Memory, Policy};
 use tce_sim::{Actor, CollectOptions, EpisodeResult};
 
 use crate::PROGRAM;
@@ -28,8 +28,18 @@ impl PolicyActor {
 }
 
 impl Actor for PolicyActor {
-    fn act(&self, observations: &[f32], rngs: &mut [Rng], actions: &mut [f32]) {
-        self.policy.act(observations, (!self.mean).then_some(rngs), actions);
+    type Memory = Memory;
+
+    fn start(&self) -> Memory {
+        self.policy.start()
+    }
+
+    fn act(&self, observations: &[f32], memories: &mut [Memory], rngs: &mut [Rng], actions: &mut [f32]) {
+        self.policy.act_with(observations, memories, (!self.mean).then_some(rngs), actions);
+    }
+
+    fn reward(&self, memory: &mut Memory, reward: f64) {
+        self.policy.reward(memory, reward);
     }
 }
 
@@ -39,8 +49,7 @@ pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
         Some(exhibit) => exhibit.policy()?,
         None => Policy::load(path)?,
     };
-    let spec = policy.spec();
-    let (found, expected) = ((spec.observations, spec.actions), agent.dims());
+    let (found, expected) = (policy.dims(), agent.dims());
     if found != expected {
         return Err(Error::Failed(format!(
             "{}: a policy of {} observations and {} actions; {agent} has {} and {}. Choose a policy of this agent",

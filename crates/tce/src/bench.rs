@@ -19,8 +19,8 @@ use tce_diffusion::{
 use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::{
-    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, Place,
-    Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
+    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
+    MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
 use tce_nn::{Checkpoints, cpu, product_rate, tensor};
 use tce_sim::{CollectOptions, UniformActor, collect};
@@ -70,6 +70,8 @@ const WORKLOADS: &[Workload] = &[
     ("rebrac", "ReBRAC", || method(Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
+    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", || meta_dt(0)),
+    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", || meta_dt(1 << 40)),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
     ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", || score_eval(1024)),
     ("score-eval-4k", "the same, 4 096 rows", || score_eval(4096)),
@@ -261,6 +263,30 @@ fn bc() -> Body {
     let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, &cpu()).expect("defaults");
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, ACT]);
     learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
+}
+
+/// The world model's updates for `world` steps, then the transformer's.
+fn meta_dt(world: u64) -> Body {
+    let mut c = MetaDtConfig::default();
+    c.world_model.steps = world;
+    // Few rows: their contexts, which a training computes once, are all there after the warm-up.
+    let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(BATCH).expect("target rows");
+    let learner = MetaDt::new(&buffer, &c, &cpu()).expect("defaults");
+    let (w, square) = (&c.world_model, (c.embed * c.embed) as f64);
+    let products = if world > 0 {
+        let step = (OBS + ACT + 1) * w.features + 3 * w.gru * (3 * w.features + w.gru);
+        let decoder = |out: usize| row_products(&[OBS + ACT + w.latent, w.hidden[0], w.hidden[1], out]).0;
+        (w.horizon * step + w.gru * w.latent) as f64 + decoder(OBS) + decoder(1)
+    } else {
+        let (all, states) = ((3 * c.context - 1) as f64, c.context as f64);
+        // Query, key, value and output take 4 products of a token with a square, the two layers behind them 8; the last block
+        // computes keys and values alone for the tokens that are no states.
+        let blocks = (c.layers - 1) as f64 * (12.0 * all * square + 2.0 * all * all * c.embed as f64);
+        let last = (2.0 * all + 10.0 * states) * square + 2.0 * all * states * c.embed as f64;
+        let step = OBS * w.features + (1 + w.features + w.latent + 2 * ACT) * c.embed;
+        blocks + last + states * step as f64
+    };
+    learning(vec![(buffer, Box::new(learner))], 2.0 * c.batch as f64 * 3.0 * products)
 }
 
 fn cvae() -> Body {

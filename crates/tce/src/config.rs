@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, Mode, OtdfConfig,
-    RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDt, MetaDtConfig,
+    Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -200,6 +200,8 @@ pub enum Algorithm {
     Bosa,
     /// DmC's: implicit Q-learning on filtered rows, weighed by their scores.
     Dmc,
+    /// A decision transformer on contexts of a world model.
+    MetaDt,
 }
 
 /// The learner; the keys of algorithms that are not trained are not looked at.
@@ -222,6 +224,7 @@ pub struct LearnerConfig {
     pub otdf: OtdfConfig,
     pub bosa: BosaConfig,
     pub dmc: DmcConfig,
+    pub meta_dt: MetaDtConfig,
     pub behaviour: RegulariserConfig,
 }
 
@@ -232,7 +235,15 @@ impl LearnerConfig {
             Algorithm::Iql | Algorithm::Dara | Algorithm::Srpo | Algorithm::Igdf => Some(self.iql.clone()),
             Algorithm::Otdf => Some(self.otdf.backbone(&self.iql)),
             Algorithm::Dmc => Some(self.dmc.backbone(&self.iql)),
-            Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa => None,
+            Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa | Algorithm::MetaDt => None,
+        }
+    }
+
+    /// Steps of the whole training: `steps` of the policy, and before them those of a model that it needs.
+    pub fn updates(&self) -> u64 {
+        match self.algorithm {
+            Algorithm::MetaDt => MetaDt::updates(&self.meta_dt, self.steps),
+            _ => self.steps,
         }
     }
 
@@ -258,6 +269,7 @@ impl LearnerConfig {
             Algorithm::Otdf => ("otdf", json!(self.otdf)),
             Algorithm::Bosa => ("bosa", json!(self.bosa)),
             Algorithm::Dmc => ("dmc", json!(self.dmc)),
+            Algorithm::MetaDt => ("meta_dt", json!(self.meta_dt)),
         }
     }
 
@@ -287,7 +299,7 @@ impl LearnerConfig {
     }
 
     fn check(&self) -> Result<()> {
-        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, dmc, .. } = self;
+        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, dmc, meta_dt, .. } = self;
         let iql = self.backbone().unwrap_or_else(|| iql.clone());
         let checks = [
             ("iql", iql.check()),
@@ -299,6 +311,7 @@ impl LearnerConfig {
             ("otdf", otdf.check()),
             ("bosa", bosa.check()),
             ("dmc", dmc.check()),
+            ("meta_dt", meta_dt.check()),
         ];
         let named = |(name, check): (&str, std::result::Result<(), LearnError>)| {
             check.map_err(|e| Error::Usage(format!("learner.{name}: {e}")))

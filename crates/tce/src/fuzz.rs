@@ -7,14 +7,15 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use rand::RngExt;
 use tce_base::{Rng, Streams, write_sealed};
-use tce_data::{LoadOptions, load};
+use tce_data::{LoadOptions, Standardizer, Transitions, load};
 use tce_diffusion::ScoreModel;
-use tce_learn::{Policy, import::load_npz};
+use tce_learn::{Buffer, Member, MetaDt, MetaDtConfig, Policy, PolicyLearner, import::load_npz};
 use tce_nn::{Checkpoints, NamedParameters, cpu};
 
 use crate::layers::{Layered, Preset};
@@ -150,7 +151,7 @@ fn fuzz_safetensors() {
         parameters
     };
     let policy = exhibit.parameters().unwrap().to_half_bytes();
-    let seeds = vec![small("score").to_bytes(), small("policy").to_half_bytes(), policy];
+    let seeds = vec![small("score").to_bytes(), small("policy").to_half_bytes(), policy, sequence_policy()];
     fuzz("safetensors", seeds, 16, |bytes, path| {
         if let Ok(parameters) = NamedParameters::from_bytes(bytes, path) {
             let _ = Card::of(&parameters, path);
@@ -158,6 +159,18 @@ fn fuzz_safetensors() {
             let _ = ScoreModel::from_parameters(&parameters, path, &cpu());
         }
     });
+}
+
+/// The smallest policy with a memory.
+fn sequence_policy() -> Vec<u8> {
+    let mut t = Transitions::new(1, 1);
+    t.push(&[0.0], &[0.0], 1.0, &[0.0], false, true);
+    let (streams, standardizer) = (Streams::new(0), Standardizer::identity(1));
+    let member = Member { streams, parts: vec![Arc::new(t)], standardizer, reward_scale: 1.0, row_scores: None };
+    let buffer = Buffer::new(vec![member], 1).unwrap();
+    let mut config = MetaDtConfig { embed: 2, layers: 1, timesteps: 2, ..MetaDtConfig::default() };
+    (config.world_model.features, config.world_model.gru, config.world_model.latent) = (1, 1, 1);
+    MetaDt::new(&buffer, &config, &cpu()).unwrap().policies()[0].to_parameters().to_bytes()
 }
 
 #[test]

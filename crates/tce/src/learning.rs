@@ -77,10 +77,11 @@ pub fn learn(
     let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
     let mut lanes: Vec<_> =
         learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
-    let steps = Steps::new(config.steps, (config.steps / 50).max(1));
+    let updates = config.updates();
+    let steps = Steps::new(updates, (updates / 50).max(1));
     let label = format!("learn {} {seeds:?}", config.algorithm.method().name);
     let mut learned = Learned::default();
-    let due = |step: u64| step < config.steps && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
+    let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
     let metrics = &mut Metrics::resume(directory, |_, at| at <= from)?;
@@ -116,7 +117,7 @@ pub fn learn(
     if let Some(arena) = arena {
         learned.evaluations = judge(&policies, &seeds, evaluation.episodes, arena)?;
         for (m, e) in learned.evaluations.iter().enumerate() {
-            metrics.log("evaluate", config.steps, m, e.score.map(|s| ("score", s)))?;
+            metrics.log("evaluate", updates, m, e.score.map(|s| ("score", s)))?;
         }
     }
     learned.seconds = started.elapsed().as_secs_f64();

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use serde::Serialize;
 use tce_data::{Rows, Transitions, TransportOptions, density_scores, transport_costs};
 use tce_learn::{
-    Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo, Td3Bc,
+    Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, MetaDt, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo,
+    Td3Bc,
 };
 use tce_nn::Device;
 
@@ -32,7 +33,7 @@ pub struct Method {
 
 impl Algorithm {
     /// All of them, in the order of the list.
-    pub const ALL: [Algorithm; 10] = [
+    pub const ALL: [Algorithm; 11] = [
         Algorithm::Bc,
         Algorithm::Iql,
         Algorithm::Td3Bc,
@@ -43,6 +44,7 @@ impl Algorithm {
         Algorithm::Igdf,
         Algorithm::Otdf,
         Algorithm::Dmc,
+        Algorithm::MetaDt,
     ];
 
     /// What it is.
@@ -120,6 +122,14 @@ impl Algorithm {
                 "dmc",
                 "source rows, or rows of mixture.generated = \"dmc\"",
             ),
+            Algorithm::MetaDt => (
+                "meta-dt",
+                "a decision transformer on contexts of a world model, zero-shot",
+                "Meta-DT 2024",
+                None,
+                "meta_dt",
+                any,
+            ),
         };
         Method { name, description, reference, published, table, needs }
     }
@@ -154,6 +164,7 @@ pub fn build(
         }
         Algorithm::Otdf => Box::new(Otdf::new(buffer, &config.otdf, iql, regulariser()?, steps, device)?),
         Algorithm::Dmc => Box::new(Dmc::new(buffer, &config.dmc, iql, regulariser()?, steps, device)?),
+        Algorithm::MetaDt => Box::new(MetaDt::new(buffer, &config.meta_dt, device)?),
         Algorithm::Bosa => Box::new(Bosa::new(buffer, &config.bosa, steps, place, device)?.ok_or(Error::Interrupted)?),
     })
 }

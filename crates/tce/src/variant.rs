@@ -52,6 +52,8 @@ pub enum Variant {
     Otdf,
     /// OTDF as its public code has it.
     OtdfPublished,
+    /// Meta-DT on target and source rows, zero-shot.
+    MetaDt,
     /// TD3+BC on target and source rows.
     Td3Bc,
     /// ReBRAC on target and source rows.
@@ -96,6 +98,7 @@ impl Variant {
             Variant::Srpo | Variant::SrpoPublished => "SRPO",
             Variant::Igdf | Variant::IgdfPublished => "IGDF",
             Variant::Otdf | Variant::OtdfPublished => "OTDF",
+            Variant::MetaDt => "Meta-DT*",
             Variant::Td3Bc => "TD3+BC",
             Variant::Rebrac => "ReBRAC",
             Variant::Synther => "SynthER",
@@ -159,6 +162,7 @@ impl Variant {
             Variant::Otdf | Variant::OtdfPublished => rival("otdf", "otdf", beta_reg),
             Variant::Synther => format!("{}learner.iql.regulariser = \"none\"\n", iql("synther", "none", 0.0)),
             Variant::Dmc | Variant::DmcPublished => rival("dmc", "dmc", ""),
+            Variant::MetaDt => rival("meta-dt", "meta_dt", ""),
             Variant::Td3Bc => rival("td3-bc", "td3_bc", ""),
             Variant::Rebrac => rival("rebrac", "rebrac", ""),
             Variant::BcRaw => bc("learner.standardise = false\n"),

@@ -202,7 +202,7 @@ mod tests {
             let card = exhibit.card().unwrap();
             assert_eq!(card.name().as_deref(), Some(exhibit.name));
             let policy = exhibit.policy().unwrap();
-            assert_eq!((policy.spec().observations, policy.spec().actions), card.agent.dims(), "{}", exhibit.name);
+            assert_eq!(policy.dims(), card.agent.dims(), "{}", exhibit.name);
             assert!(card.std >= 0.0 && card.episodes >= 20 && card.mean.is_finite(), "{}", exhibit.name);
             assert_eq!(Exhibit::at(&exhibit.path()).unwrap().unwrap().sha256(), exhibit.sha256());
         }

@@ -286,6 +286,36 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     assert_eq!(inspected.as_array().unwrap().len(), 2);
 }
 
+/// A policy that remembers its episode goes through files and environments like any other.
+#[test]
+fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
+    let dir = tempfile::tempdir().unwrap();
+    data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let learn = |out: &str, threads: &str| {
+        let mut args = vec!["learn", "--target", "target.hdf5", "--extra", "source.hdf5", "--algorithm", "meta-dt"];
+        args.extend(["--env", "hopper-morph", "--seeds", "2", "--out", out, "--threads", threads]);
+        args.extend(["--set", "learner.steps=20", "--set", "learner.meta_dt.world_model.steps=10"]);
+        args.extend(["--set", "learner.meta_dt.embed=16", "--set", "evaluation.episodes=2"]);
+        tce_json(dir.path(), &args)
+    };
+    let learned = learn("one", "1");
+    assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
+    assert!(learned["figures"]["world_state_loss"][0].is_number() && learned["figures"]["policy_loss"][1].is_number());
+    assert_eq!(learn("two", "2")["evaluations"], learned["evaluations"]);
+    let files = ["one", "two"].map(|o| fs::read(dir.path().join(o).join("policy-seed1.safetensors")).unwrap());
+    assert!(files[0] == files[1], "another number of threads gave another policy");
+
+    let policy = "one/policy-seed1.safetensors";
+    let evaluated =
+        tce_json(dir.path(), &["evaluate", policy, "--env", "hopper-morph", "--episodes", "2", "--seed", "1"]);
+    assert_eq!(evaluated[0]["returns"], learned["evaluations"][1]["returns"]);
+    let wrong = tce(dir.path(), &["evaluate", policy, "--env", "ant-morph"]);
+    assert!(String::from_utf8_lossy(&wrong.stderr).contains("a policy of 11 observations and 3 actions"));
+    let collect =
+        ["collect", "--env", "hopper-morph", "--actor", policy, "--rows", "200", "--lanes", "4", "--out", "c.hdf5"];
+    assert_eq!(tce_json(dir.path(), &collect)["content"]["rows"], 200);
+}
+
 /// An interrupted run keeps the stages it finished and takes them up when it is called again.
 #[cfg(unix)]
 #[test]

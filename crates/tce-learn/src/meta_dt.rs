@@ -1,0 +1,399 @@
+//! Meta-DT (Wang et al. 2024) as TCE compares with it (Meta-DT*): without prompts, trained on target and source rows alike.
+//!
+//! ```text
+//! z   = E(the h steps before), L_W = mean (ŝ' - s')² + mean (r̂ - r)²        first, on its own → world model (see world_model)
+//! π_t = DT(R̂, s, z, a of the last K steps; the step's own R̂, s, z)           causal (see transformer), E as it is now
+//! L_π = mean over steps and action dimensions of (π_t - a_t)²                → DT
+//! ```
+//!
+//! A member's segments are half from the target, half from the source ([`crate::sequences`]). Steps 0 to `world_model.steps` - 1 of
+//! the training are the world model's, the others the transformer's: [`MetaDt::updates`].
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | K | `context` | 8 | Meta-DT |
+//! | - | `embed`, `layers`, `heads` | 128, 3, 1; ReLU | Meta-DT |
+//! | - | `dropout` | .1 | Meta-DT; GPT-2's places, see [`crate::transformer`] |
+//! | - | `timesteps` | 1000 | episodes of MuJoCo; DT's embedding of t |
+//! | - | `lr`, `weight_decay` | 5e-5, 1e-4: AdamW | Meta-DT |
+//! | - | `warm_up` | 10 000 steps, linear | Meta-DT |
+//! | - | `grad_clip` | .25 | Meta-DT |
+//! | - | `batch` | 128 segments | Meta-DT |
+//! | - | `return_scale` | 500 | Meta-DT |
+//! | R̂_1 | `return_factor` | 1, times the best return of a trajectory of the target | ours: what a user without a simulator has to go by; DT's authors took the expert's |
+//! | - | `world_model.steps` | 10 000 | ours; Meta-DT: 201 passes over its data |
+//! | - | `world_model.lr`, `.batch`, `.grad_clip` | 1e-3, 128, 1 | Meta-DT |
+//! | h | `world_model.horizon` | 8 | ours: as many steps as the transformer sees |
+//! | - | `world_model.features`, `.gru`, `.latent`, `.hidden` | 16, 128, 16, (128, 128) | Meta-DT |
+//!
+//! Rewards are used as they are: a buffer's `reward_scale` is for critics, and `return_scale` does its work here.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::burn::tensor::{Int, TensorData};
+use tce_nn::{AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
+
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::{LearnError, within};
+use crate::networks::Dropout;
+use crate::policy::Policy;
+use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
+use crate::sequences::{Segments, Trajectories};
+use crate::training::{Learner, Meter, PolicyLearner};
+use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
+use crate::world_model::{Contexts, Place, SegmentTensors, WorldModel, WorldModelConfig, strip};
+
+/// The configuration of [`MetaDt`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MetaDtConfig {
+    /// K
+    pub context: usize,
+    /// Width of a token.
+    pub embed: usize,
+    /// Blocks.
+    pub layers: usize,
+    /// Heads of attention; they share the width of a token.
+    pub heads: usize,
+    /// Share of the activations that are dropped.
+    pub dropout: f64,
+    /// Steps of an episode that are told apart.
+    pub timesteps: usize,
+    /// Learning rate after the warm-up.
+    pub lr: f64,
+    /// Decoupled weight decay, multiplied by the learning rate.
+    pub weight_decay: f64,
+    /// Steps over which the learning rate rises from 0.
+    pub warm_up: u64,
+    /// Greatest norm of the gradient.
+    pub grad_clip: f64,
+    /// Segments per step.
+    pub batch: usize,
+    /// Divides returns to go.
+    pub return_scale: f64,
+    /// R̂_1 over the best return of a trajectory of the target.
+    pub return_factor: f64,
+    /// What the contexts come from.
+    pub world_model: WorldModelConfig,
+}
+
+impl Default for MetaDtConfig {
+    fn default() -> Self {
+        Self {
+            context: 8,
+            embed: 128,
+            layers: 3,
+            heads: 1,
+            dropout: 0.1,
+            timesteps: 1000,
+            lr: 5e-5,
+            weight_decay: 1e-4,
+            warm_up: 10_000,
+            grad_clip: 0.25,
+            batch: 128,
+            return_scale: 500.0,
+            return_factor: 1.0,
+            world_model: WorldModelConfig::default(),
+        }
+    }
+}
+
+impl MetaDtConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("context", self.context as f64, 1.0..=MAX_CONTEXT as f64)?;
+        for (field, value) in
+            [("embed", self.embed), ("layers", self.layers), ("heads", self.heads), ("batch", self.batch)]
+        {
+            within(field, value as f64, 1.0..=65536.0)?;
+        }
+        within("timesteps", self.timesteps as f64, 1.0..=1e7)?;
+        within("dropout", self.dropout, 0.0..=0.99)?;
+        within("lr", self.lr, 0.0..=1.0)?;
+        within("weight_decay", self.weight_decay, 0.0..=1e3)?;
+        within("grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
+        within("return_scale", self.return_scale, f64::MIN_POSITIVE..=1e12)?;
+        within("return_factor", self.return_factor, -1e6..=1e6)?;
+        if !self.embed.is_multiple_of(self.heads) {
+            let expected = format!("a divisor of embed = {}", self.embed);
+            return Err(LearnError::invalid("heads", self.heads, expected, "correct the configuration"));
+        }
+        self.world_model.check()
+    }
+
+    /// Learning rate of the transformer's step `step`.
+    fn rate(&self, step: u64) -> f64 {
+        self.lr * ((step + 1) as f64 / self.warm_up.max(1) as f64).min(1.0)
+    }
+}
+
+/// Meta-DT of a population: a member's networks are modules of their own.
+pub struct MetaDt {
+    config: MetaDtConfig,
+    buffer: Buffer,
+    members: Vec<MemberNets>,
+    device: Device,
+}
+
+struct MemberNets {
+    streams: Streams,
+    trajectories: Trajectories,
+    world: Trained<WorldModel>,
+    /// Of the finished world model.
+    contexts: Contexts,
+    transformer: Trained<DecisionTransformer>,
+}
+
+impl MetaDt {
+    /// New networks for the members of `buffer`.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used.
+    pub fn new(buffer: &Buffer, config: &MetaDtConfig, device: &Device) -> Result<Self, LearnError> {
+        config.check()?;
+        let trainable = device.clone().autodiff();
+        let (inputs, actions) = (buffer.inputs().len(), buffer.act_dim());
+        let clipped = |max_norm: f64, weight_decay: f64| AdamConfig {
+            max_norm: Some(max_norm),
+            weight_decay,
+            ..AdamConfig::default()
+        };
+        let nets = |member: &crate::buffer::Member| {
+            let world = config.world_model.init(inputs, actions, member.streams, &trainable);
+            let transformer = sizes(config, inputs, actions).init(member.streams, &trainable);
+            let trajectories = Trajectories::new(member);
+            MemberNets {
+                streams: member.streams,
+                contexts: Contexts::new(&trajectories, config.world_model.latent),
+                trajectories,
+                world: Trained::with(world, clipped(config.world_model.grad_clip, 0.0)),
+                transformer: Trained::with(transformer, clipped(config.grad_clip, config.weight_decay)),
+            }
+        };
+        let members = buffer.members().iter().map(nets).collect();
+        Ok(Self { config: config.clone(), buffer: buffer.clone(), members, device: device.clone() })
+    }
+
+    /// Steps of a training in which the transformer makes `steps`: the world model's come before.
+    pub fn updates(config: &MetaDtConfig, steps: u64) -> u64 {
+        config.world_model.steps + steps
+    }
+}
+
+fn sizes(c: &MetaDtConfig, inputs: usize, actions: usize) -> TransformerSizes {
+    TransformerSizes {
+        inputs,
+        actions,
+        latent: c.world_model.latent,
+        features: c.world_model.features,
+        embed: c.embed,
+        layers: c.layers,
+        heads: c.heads,
+        timesteps: c.timesteps,
+    }
+}
+
+impl MemberNets {
+    /// A step down L_W; its two terms.
+    fn world_step(&mut self, segments: &Segments, c: &WorldModelConfig, device: &Device) -> [f64; 2] {
+        let batch = SegmentTensors::new(segments, 1, device);
+        let [state, reward] = self.world.net().losses(&batch, strip(segments, c.batch, device));
+        let figures = [&state, &reward].map(|l| host(l.clone())[0] as f64);
+        self.world.step(state + reward, c.lr);
+        figures
+    }
+
+    /// π at the steps of `segments`, `[B, K, A]`.
+    fn actions(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<3> {
+        let encoder = self.world.net().encoder.valid();
+        let contexts = self.contexts.of(segments, c.context, &encoder, &self.trajectories, place);
+        let batch = SegmentTensors::new(segments, c.context, place.device);
+        let shape = [c.batch, c.context];
+        let on_device = |v: Vec<f32>| {
+            let width = v.len() / (c.batch * c.context);
+            tensor(v, [c.batch, c.context, width], place.device)
+        };
+        let times: Vec<i32> = segments.times.iter().map(|t| (*t).min(c.timesteps as i32 - 1)).collect();
+        let input = TransformerInput {
+            returns: on_device(segments.returns_to_go.iter().map(|r| r / c.return_scale as f32).collect()),
+            states: batch.s,
+            contexts: on_device(contexts),
+            actions: batch.a,
+            times: Tensor::<2, Int>::from_data(TensorData::new(times, shape), place.device),
+        };
+        self.transformer.net().forward(input, dropout)
+    }
+
+    /// L_π of `segments`, `[1]`.
+    fn policy_loss(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<1> {
+        let actions = self.actions(segments, place, c, dropout);
+        let [b, k, width] = actions.dims();
+        let data = tensor(segments.actions.clone(), [b, k, width], place.device);
+        let valid = tensor(segments.valid.clone(), [b, k, 1], place.device);
+        let numbers = segments.valid.iter().sum::<f32>() * width as f32;
+        ((actions - data).square() * valid).sum() / numbers
+    }
+}
+
+impl Learner for MetaDt {
+    /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
+    fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, buffer, members, device } = self;
+        let w = &c.world_model;
+        let mut figures: [Vec<f64>; 2] = Default::default();
+        for (m, nets) in members.iter_mut().enumerate() {
+            if let Some(step) = step.checked_sub(w.steps) {
+                let segments = nets.trajectories.sample(buffer, m, w.steps + step, [c.batch, c.context, 0]);
+                let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
+                let place = Place { buffer, member: m, device };
+                let loss = nets.policy_loss(&segments, place, c, &mut dropout);
+                figures[0].push(host(loss.clone())[0] as f64);
+                nets.transformer.step(loss, c.rate(step));
+            } else {
+                let segments = nets.trajectories.sample(buffer, m, step, [w.batch, 1, w.horizon]);
+                let [state, reward] = nets.world_step(&segments, w, device);
+                figures[0].push(state);
+                figures[1].push(reward);
+            }
+        }
+        if meter.active() {
+            let names = if step < w.steps { ["world_state_loss", "world_reward_loss"] } else { ["policy_loss", ""] };
+            for (name, values) in names.into_iter().zip(figures).filter(|(name, _)| !name.is_empty()) {
+                meter.add(name, values);
+            }
+        }
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        for (m, nets) in self.members.iter().enumerate() {
+            nets.world.save(&format!("world.{m}"), &mut state);
+            nets.transformer.save(&format!("transformer.{m}"), &mut state);
+        }
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        for (m, nets) in self.members.iter_mut().enumerate() {
+            nets.world.load(&format!("world.{m}"), state, path)?;
+            nets.transformer.load(&format!("transformer.{m}"), state, path)?;
+            nets.contexts = Contexts::new(&nets.trajectories, self.config.world_model.latent);
+        }
+        Ok(())
+    }
+}
+
+impl PolicyLearner for MetaDt {
+    fn policies(&self) -> Vec<Policy> {
+        let (buffer, c) = (&self.buffer, &self.config);
+        let (inputs, actions) = (buffer.inputs().len(), buffer.act_dim());
+        let policy = |(nets, member): (&MemberNets, &crate::buffer::Member)| {
+            let spec = SequenceSpec {
+                observations: buffer.obs_dim(),
+                actions,
+                inputs: buffer.inputs().to_vec(),
+                standardizer: member.standardizer.clone(),
+                context: c.context,
+                encoder: c.world_model.sizes(inputs, actions),
+                transformer: sizes(c, inputs, actions),
+                return_scale: c.return_scale,
+                first_return: c.return_factor * nets.trajectories.best_target_return(),
+            };
+            let policy = SequencePolicy::of(spec, &nets.world.net().encoder, nets.transformer.net());
+            Policy::Sequence(Box::new(policy))
+        };
+        self.members.iter().zip(buffer.members()).map(policy).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+    use tce_base::random::fill_normal;
+    use tce_data::{Standardizer, Transitions};
+    use tce_nn::cpu;
+
+    /// Episodes of 7, 1 and 5 steps, of three observations (one of them constant), two actions.
+    fn learner() -> (MetaDt, Arc<Transitions>) {
+        let mut t = Transitions::new(3, 2);
+        let mut row = [0.0; 9];
+        for i in 0..13 {
+            fill_normal(&mut Streams::new(3).indexed("row", i), &mut row);
+            (row[1], row[7]) = (4.0, 4.0);
+            t.push(&row[..3], &[row[3].tanh(), row[4].tanh()], row[5], &row[6..], i == 6, i == 7);
+        }
+        let t = Arc::new(t);
+        let standardizer = Standardizer::fit(&t.observations, 3);
+        let member = crate::Member {
+            streams: Streams::new(1),
+            parts: vec![t.clone()],
+            standardizer,
+            reward_scale: 1.0,
+            row_scores: None,
+        };
+        let buffer = Buffer::new(vec![member], 2).unwrap();
+        let mut config = MetaDtConfig { context: 3, embed: 16, heads: 2, batch: 5, ..MetaDtConfig::default() };
+        (config.timesteps, config.return_scale) = (4, 2.0);
+        (config.world_model.horizon, config.world_model.gru) = (2, 8);
+        (MetaDt::new(&buffer, &config, &cpu()).unwrap(), t)
+    }
+
+    /// The loss of a batch, from the actions of the finished policy as it is led through the table's episodes step by step: what
+    /// training computes is what an evaluation computes, and the loss is the mean over the steps that are there.
+    #[test]
+    fn the_loss_is_that_of_the_policy_that_acts() {
+        let (mut learner, t) = learner();
+        let mut policy = learner.policies().remove(0);
+        let mut errors = Vec::new();
+        for episode in t.episodes() {
+            let Policy::Sequence(sequence) = &mut policy else { panic!("a policy with a memory") };
+            // What the data got in this episode is what the policy is asked for.
+            let mut memory = sequence.asked(episode.episode_return).start();
+            let mut a = [0.0; 2];
+            for i in episode.start..episode.end {
+                sequence.act(t.observation(i), &mut [&mut memory], &mut a);
+                errors.push(a.iter().zip(t.action(i)).map(|(a, b)| (a - b).powi(2)).sum::<f32>());
+                // As if it had done what the data did.
+                memory.act(t.action(i));
+                memory.reward(t.rewards[i].into());
+            }
+        }
+        let MetaDt { config: c, buffer, members, device } = &mut learner;
+        let nets = &mut members[0];
+        let segments = nets.trajectories.sample(buffer, 0, 11, [c.batch, c.context, 0]);
+        let place = Place { buffer, member: 0, device };
+        let loss = host(nets.policy_loss(&segments, place, c, &mut Dropout::none()))[0];
+        let begin = |row: usize| [0, 7, 8].into_iter().rfind(|b| *b <= row).unwrap();
+        let rows = segments.picks.iter().flat_map(|p| {
+            let row = p.row as usize;
+            begin(row).max((row + 1).saturating_sub(3))..row + 1
+        });
+        let rows: Vec<_> = rows.collect();
+        // The policy sees three steps, a segment's later steps as well; a segment that begins within an episode sees fewer.
+        let whole: Vec<_> = segments.picks.iter().map(|p| p.row as usize).collect();
+        assert!(rows.len() > whole.len());
+        let per_step = host(nets.actions(&segments, place, c, &mut Dropout::none()));
+        for (k, row) in whole.into_iter().enumerate() {
+            let last = segments.valid[3 * k..][..3].iter().filter(|v| **v > 0.0).count() - 1;
+            let own = &per_step[(3 * k + last) * 2..][..2];
+            let error = own.iter().zip(t.action(row)).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+            assert!((error - errors[row]).abs() < 1e-5, "row {row}: {error} {}", errors[row]);
+        }
+        let own = per_step.chunks(2).zip(segments.actions.chunks(2)).zip(&segments.valid);
+        let sum: f32 = own.map(|((a, b), v)| v * ((a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2))).sum();
+        assert!((loss - sum / (2.0 * rows.len() as f32)).abs() < 1e-6, "{loss}");
+    }
+
+    #[test]
+    fn the_rate_rises_and_stays() {
+        let c = MetaDtConfig::default();
+        assert!((c.rate(0) - 5e-9).abs() < 1e-18 && (c.rate(4999) - 2.5e-5).abs() < 1e-15);
+        assert_eq!((c.rate(9_999), c.rate(1 << 40)), (5e-5, 5e-5));
+    }
+}

@@ -1,0 +1,398 @@
+//! The world model of Meta-DT, whose context z tells domains apart by their dynamics and rewards.
+//!
+//! ```text
+//! f_t  = [relu(W_s s_t); relu(W_a a_t); relu(W_r r_t)]           features of a step, each of three parts 16 wide
+//! z_t  = W_z GRU(f_(t-h), ..., f_(t-1)) + b_z                    context of the h steps before t, in R^16
+//! ŝ'_t = MLP_s([s_t; a_t; z_t]);  r̂_t = MLP_r([s_t; a_t; z_t])   decoders, 128-128 ReLU
+//! L    = mean (ŝ' - s')² + mean (r̂ - r)²
+//! ```
+//!
+//! z_t is made of what lies before t, so that it is known when a_t is chosen. Steps before an episode's beginning are zeros.
+
+use std::collections::BTreeSet;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::burn::nn::{Initializer, Linear, LinearConfig, gru::Gru, gru::GruConfig};
+use tce_nn::burn::tensor::activation::relu;
+use tce_nn::{Device, Module, Tensor, host, tensor};
+
+use crate::buffer::{Buffer, Pick};
+use crate::error::{LearnError, within};
+use crate::networks::{Start, initialise};
+use crate::sequences::{Segments, Trajectories};
+
+/// The sizes of a [`ContextEncoder`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncoderSizes {
+    /// Observation dimensions that are seen.
+    pub inputs: usize,
+    /// Action dimensions.
+    pub actions: usize,
+    /// Width of each part of f.
+    pub features: usize,
+    /// Width of the GRU.
+    pub hidden: usize,
+    /// Width of z.
+    pub latent: usize,
+    /// h
+    pub horizon: usize,
+}
+
+impl EncoderSizes {
+    /// Numbers that an encoder of these sizes holds.
+    pub(crate) fn parameters(&self) -> f64 {
+        let [d, a, f, g, z] = [self.inputs, self.actions, self.features, self.hidden, self.latent].map(|n| n as f64);
+        (d + a + 1.0 + 3.0) * f + 3.0 * (3.0 * f + g + 2.0) * g + (g + 1.0) * z
+    }
+
+    /// New networks; `name` tells their random streams from others'.
+    pub(crate) fn init(&self, name: &str, streams: Streams, device: &Device) -> ContextEncoder {
+        let c = self;
+        let encoder = ContextEncoder {
+            state: linear(c.inputs, c.features, device),
+            action: linear(c.actions, c.features, device),
+            reward: linear(1, c.features, device),
+            gru: GruConfig::new(3 * c.features, c.hidden, true).with_initializer(Initializer::Zeros).init(device),
+            latent: linear(c.hidden, c.latent, device),
+            horizon: c.horizon,
+        };
+        // PyTorch's GRU: all weights and biases within one over the root of the hidden width.
+        let bound = 1.0 / (c.hidden as f32).sqrt();
+        initialise(encoder, name, streams, |path| match path.starts_with("gru.") {
+            true => Start::Uniform(bound),
+            false => Start::Linear,
+        })
+    }
+}
+
+/// A layer whose weights are drawn afterwards.
+pub(crate) fn linear(input: usize, output: usize, device: &Device) -> Linear {
+    LinearConfig::new(input, output).with_initializer(Initializer::Zeros).init(device)
+}
+
+/// From the steps before to z; see the [module](self).
+#[derive(Module, Debug)]
+pub struct ContextEncoder {
+    state: Linear,
+    action: Linear,
+    reward: Linear,
+    gru: Gru,
+    latent: Linear,
+    horizon: usize,
+}
+
+impl ContextEncoder {
+    /// z of every step of segments: strips `[B, h + K - 1, ·]` of states, actions and rewards → `[B, K, Z]`.
+    pub fn contexts(&self, [states, actions, rewards]: [Tensor<3>; 3]) -> Tensor<3> {
+        let [batch, strip, _] = states.dims();
+        let h = self.horizon;
+        let steps = strip + 1 - h;
+        let features = [self.state.forward(states), self.action.forward(actions), self.reward.forward(rewards)];
+        let features = relu(Tensor::cat(features.to_vec(), 2));
+        let windows = (0..steps).map(|k| features.clone().narrow(1, k, h)).collect();
+        let hidden = self.gru.forward(Tensor::cat(windows, 0), None).narrow(1, h - 1, 1);
+        let z = self.latent.forward(hidden);
+        let width = z.dims()[2];
+        z.reshape([steps, batch, width]).swap_dims(0, 1)
+    }
+}
+
+/// Encoder and decoders of one member.
+#[derive(Module, Debug)]
+pub struct WorldModel {
+    /// What gives z.
+    pub encoder: ContextEncoder,
+    next_state: Vec<Linear>,
+    reward: Vec<Linear>,
+}
+
+impl WorldModel {
+    /// (ŝ', r̂) `[B, K, ·]` for s, a and z of the same shape.
+    pub fn predict(&self, s: Tensor<3>, a: Tensor<3>, z: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
+        let x = Tensor::cat(vec![s, a, z], 2);
+        let run = |layers: &[Linear]| {
+            let (last, hidden) = layers.split_last().expect("at least the output layer");
+            last.forward(hidden.iter().fold(x.clone(), |x, layer| relu(layer.forward(x))))
+        };
+        (run(&self.next_state), run(&self.reward))
+    }
+
+    /// The two terms of L, `[1]` each, of segments of one step and their strips.
+    pub fn losses(&self, batch: &SegmentTensors, strip: [Tensor<3>; 3]) -> [Tensor<1>; 2] {
+        let z = self.encoder.contexts(strip);
+        let (next_state, reward) = self.predict(batch.s.clone(), batch.a.clone(), z);
+        [(next_state - batch.s2.clone()).square().mean(), (reward - batch.r.clone()).square().mean()]
+    }
+}
+
+/// How the world model is made and trained; see the [module](self) and [`crate::meta_dt`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WorldModelConfig {
+    /// Training steps, before the first of the transformer's.
+    pub steps: u64,
+    /// Learning rate, constant.
+    pub lr: f64,
+    /// Rows per step.
+    pub batch: usize,
+    /// Greatest norm of the gradient.
+    pub grad_clip: f64,
+    /// h
+    pub horizon: usize,
+    /// Width of each part of f.
+    pub features: usize,
+    /// Width of the GRU.
+    pub gru: usize,
+    /// Width of z.
+    pub latent: usize,
+    /// Hidden layers of the decoders.
+    pub hidden: Vec<usize>,
+}
+
+impl Default for WorldModelConfig {
+    fn default() -> Self {
+        Self {
+            steps: 10_000,
+            lr: 1e-3,
+            batch: 128,
+            grad_clip: 1.0,
+            horizon: 8,
+            features: 16,
+            gru: 128,
+            latent: 16,
+            hidden: vec![128, 128],
+        }
+    }
+}
+
+impl WorldModelConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("world_model.lr", self.lr, 0.0..=1.0)?;
+        within("world_model.grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
+        for (field, value) in [
+            ("world_model.batch", self.batch),
+            ("world_model.horizon", self.horizon),
+            ("world_model.features", self.features),
+            ("world_model.gru", self.gru),
+            ("world_model.latent", self.latent),
+        ] {
+            within(field, value as f64, 1.0..=65536.0)?;
+        }
+        self.hidden.iter().try_for_each(|n| within("world_model.hidden", *n as f64, 1.0..=65536.0))
+    }
+
+    /// The encoder's sizes for data of so many input and action dimensions.
+    pub fn sizes(&self, inputs: usize, actions: usize) -> EncoderSizes {
+        EncoderSizes {
+            inputs,
+            actions,
+            features: self.features,
+            hidden: self.gru,
+            latent: self.latent,
+            horizon: self.horizon,
+        }
+    }
+
+    /// New networks of one member.
+    pub fn init(&self, inputs: usize, actions: usize, streams: Streams, device: &Device) -> WorldModel {
+        let encoder = self.sizes(inputs, actions).init("world/encoder", streams, device);
+        let decoder = |name: &str, output: usize| {
+            let mut widths = vec![inputs + actions + self.latent];
+            widths.extend(&self.hidden);
+            widths.push(output);
+            let layers: Vec<_> = widths.windows(2).map(|w| linear(w[0], w[1], device)).collect();
+            initialise(layers, name, streams, |_| Start::Linear)
+        };
+        WorldModel { encoder, next_state: decoder("world/state", inputs), reward: decoder("world/reward", 1) }
+    }
+}
+
+/// [`Segments`] on the device, outside of autodiff; shapes as in [`crate::sequences`].
+pub struct SegmentTensors {
+    /// s
+    pub s: Tensor<3>,
+    /// a
+    pub a: Tensor<3>,
+    /// r
+    pub r: Tensor<3>,
+    /// s'
+    pub s2: Tensor<3>,
+}
+
+impl SegmentTensors {
+    /// `segments` of `steps` steps each.
+    pub fn new(segments: &Segments, steps: usize, device: &Device) -> Self {
+        let batch = segments.rewards.len() / steps;
+        let on_device = |v: &[f32]| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device);
+        Self {
+            s: on_device(&segments.states),
+            a: on_device(&segments.actions),
+            r: on_device(&segments.rewards),
+            s2: on_device(&segments.next_states),
+        }
+    }
+}
+
+/// The strips of `batch` segments on the device: states, actions, rewards.
+pub fn strip(segments: &Segments, batch: usize, device: &Device) -> [Tensor<3>; 3] {
+    let steps = segments.strip_rewards.len() / batch;
+    [&segments.strip_states, &segments.strip_actions, &segments.strip_rewards]
+        .map(|v| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device))
+}
+
+/// Whose rows are meant, and where they are computed with.
+#[derive(Clone, Copy)]
+pub(crate) struct Place<'a> {
+    pub buffer: &'a Buffer,
+    pub member: usize,
+    pub device: &'a Device,
+}
+
+/// z of the rows of a member's tables, under a world model that does not change any more: each is needed again and again.
+///
+/// They are computed when first asked for, in blocks that are always the same, so that a training that was resumed gets the
+/// same bits: a product of matrices may round a row differently among other rows.
+#[derive(Clone, Debug)]
+pub(crate) struct Contexts {
+    latent: usize,
+    tables: Vec<TableContexts>,
+}
+
+#[derive(Clone, Debug)]
+struct TableContexts {
+    values: Vec<f32>,
+    /// Whether a block has been computed.
+    known: Vec<bool>,
+}
+
+/// Rows of a block: few, because the segments of a training's first steps touch as many blocks as they have rows.
+const BLOCK: usize = 64;
+
+impl Contexts {
+    /// None known yet.
+    pub(crate) fn new(trajectories: &Trajectories, latent: usize) -> Self {
+        let table =
+            |rows: usize| TableContexts { values: vec![0.0; rows * latent], known: vec![false; rows.div_ceil(BLOCK)] };
+        Self { latent, tables: trajectories.rows().map(table).collect() }
+    }
+
+    /// z of the steps of `segments`, `[B, K, Z]` row-major; behind the last step zeros.
+    pub(crate) fn of(
+        &mut self,
+        segments: &Segments,
+        steps: usize,
+        encoder: &ContextEncoder,
+        trajectories: &Trajectories,
+        Place { buffer, member, device }: Place,
+    ) -> Vec<f32> {
+        let rows = |(pick, valid): (&Pick, &[f32])| {
+            let length = valid.iter().filter(|v| **v > 0.0).count();
+            (pick.part as usize, pick.row as usize + 1 - length..pick.row as usize + 1)
+        };
+        let rows: Vec<_> = segments.picks.iter().zip(segments.valid.chunks_exact(steps)).map(rows).collect();
+        let blocks = rows.iter().flat_map(|(part, r)| (r.start / BLOCK..=(r.end - 1) / BLOCK).map(|b| (*part, b)));
+        let missing: BTreeSet<_> = blocks.filter(|&(part, b)| !self.tables[part].known[b]).collect();
+        let computed: Vec<_> = missing
+            .into_par_iter()
+            .map(|(part, block)| {
+                let end = self.tables[part].values.len() / self.latent;
+                let range = block * BLOCK..end.min((block + 1) * BLOCK);
+                let size = range.len();
+                let segments = trajectories.block(buffer, member, part, range, encoder.horizon);
+                (part, block, host(encoder.contexts(strip(&segments, size, device))))
+            })
+            .collect();
+        for (part, block, values) in computed {
+            let table = &mut self.tables[part];
+            table.values[block * BLOCK * self.latent..][..values.len()].copy_from_slice(&values);
+            table.known[block] = true;
+        }
+        let mut out = Vec::with_capacity(rows.len() * steps * self.latent);
+        for (k, (part, rows)) in rows.into_iter().enumerate() {
+            out.extend_from_slice(&self.tables[part].values[rows.start * self.latent..rows.end * self.latent]);
+            out.resize((k + 1) * steps * self.latent, 0.0);
+        }
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_base::random::fill_normal;
+    use tce_nn::{NamedParameters, cpu};
+
+    fn sizes() -> EncoderSizes {
+        EncoderSizes { inputs: 3, actions: 2, features: 4, hidden: 5, latent: 6, horizon: 3 }
+    }
+
+    fn noise(shape: [usize; 3], name: &str) -> Vec<f32> {
+        let mut values = vec![0.0; shape.iter().product()];
+        fill_normal(&mut Streams::new(1).stream(name), &mut values);
+        values
+    }
+
+    /// z of the second step of a segment, written out in f64 from the weights.
+    #[test]
+    fn contexts_follow_the_formula_and_see_nothing_of_their_own_step() {
+        let encoder = sizes().init("e", Streams::new(4), &cpu());
+        let strip = 4;
+        let (s, a, r) = (noise([2, strip, 3], "s"), noise([2, strip, 2], "a"), noise([2, strip, 1], "r"));
+        let run = |s: &[f32], r: &[f32]| {
+            let on = |v: &[f32], d: usize| tensor(v.to_vec(), [2, strip, d], &cpu());
+            encoder.contexts([on(s, 3), on(&a, 2), on(r, 1)])
+        };
+        let z = run(&s, &r);
+        assert_eq!(z.dims(), [2, 2, 6]);
+        let mut weights = NamedParameters::default();
+        weights.collect("e", &encoder);
+        assert_eq!(weights.tensors.values().map(|t| t.1.len()).sum::<usize>() as f64, sizes().parameters());
+        let affine = |name: &str, x: &[f64]| -> Vec<f64> {
+            let (w, b) =
+                (&weights.tensors[&format!("e.{name}.weight")].1, &weights.tensors[&format!("e.{name}.bias")].1);
+            let out = |j: usize| (0..x.len()).map(|i| x[i] * w[i * b.len() + j] as f64).sum::<f64>() + b[j] as f64;
+            (0..b.len()).map(out).collect()
+        };
+        let wide = |v: &[f32]| v.iter().map(|x| *x as f64).collect::<Vec<_>>();
+        let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
+        let mut h = vec![0.0; 5];
+        for t in 1..4 {
+            // Batch entry 1.
+            let at = strip + t;
+            let mut f = affine("state", &wide(&s[3 * at..][..3]));
+            f.extend(affine("action", &wide(&a[2 * at..][..2])));
+            f.extend(affine("reward", &wide(&r[at..][..1])));
+            f.iter_mut().for_each(|x| *x = x.max(0.0));
+            let gate = |name: &str| {
+                (
+                    affine(&format!("gru.{name}.input_transform"), &f),
+                    affine(&format!("gru.{name}.hidden_transform"), &h),
+                )
+            };
+            let (u, reset, new) = (gate("update_gate"), gate("reset_gate"), gate("new_gate"));
+            h = (0..5)
+                .map(|j| {
+                    let (u, reset) = (sigmoid(u.0[j] + u.1[j]), sigmoid(reset.0[j] + reset.1[j]));
+                    (1.0 - u) * (new.0[j] + reset * new.1[j]).tanh() + u * h[j]
+                })
+                .collect();
+        }
+        let expected = affine("latent", &h);
+        for (z, e) in host(z.clone())[18..24].iter().zip(expected) {
+            assert!((*z as f64 - e).abs() < 1e-5, "{z} {e}");
+        }
+        // The last step of the strip is the history of the segment's last step alone.
+        let (mut other, mut rewards) = (s.clone(), r.clone());
+        (other[9], rewards[3]) = (9.0, 9.0);
+        let (z, changed) = (host(z), host(run(&other, &rewards)));
+        assert_eq!(z[..6], changed[..6]);
+        assert_ne!(z[6..12], changed[6..12]);
+    }
+}
