@@ -133,7 +133,18 @@ pub struct GuidanceConfig {
     pub dropout: f64,
     pub weight: f64,
     pub from: f64,
+    pub draw: ScoreDraw,
     pub rescore: bool,
+}
+
+/// How scores are drawn between a quantile and the maximum.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ScoreDraw {
+    /// Every rank is equally likely: scores as rows have them.
+    Ranks,
+    /// Every value is equally likely.
+    Values,
 }
 
 /// Which generated rows join the target rows.

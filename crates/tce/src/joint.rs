@@ -4,9 +4,13 @@
 //! |---|---|---|
 //! | trained on | target rows | source and target rows, all equally likely |
 //! | condition | none | the row's score ([`tce_data::density`]), left out with probability `guidance.dropout` |
-//! | drawn under | none | scores c ~ U(q, max), q the `guidance.from` quantile of the training scores; D = D∅ + w (D_c − D∅) |
+//! | drawn under | none | scores c from the `guidance.from` quantile of the training scores up; D = D∅ + w (D_c − D∅) |
 //! | standardised | every dimension by its mean and spread over the training rows, but not the terminal flag | the same |
 //! | afterwards | actions clipped to the box, terminal where the flag is above ½ | the same |
+//!
+//! "Uniform in the 90-100 percentile" of scores can be read in two ways (`guidance.draw`): uniform ranks, which ask for scores as
+//! rows have them, or uniform values between the two percentiles. The scores have a long tail (Hopper morph, 100k source rows:
+//! nine tenths below .09, the best target row 1), so that values ask mostly for what hardly a row has.
 //!
 //! Dimensions that are constant in the training rows (Ant's contact slots, the flag of a robot that never falls) are left out
 //! and put back. Rows with a number that is not finite are dropped; there is no other filter.
@@ -27,7 +31,7 @@ use tce_diffusion::{
 };
 use tce_nn::{Device, NamedParameters};
 
-use crate::config::{Config, GeneratedRows, JointConfig};
+use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig, ScoreDraw};
 use crate::error::{Error, Result};
 use crate::expand::{Expansion, Generated};
 use crate::generator::{progress, run, start_rows};
@@ -135,27 +139,17 @@ fn flags(t: &Transitions) -> Vec<f32> {
     t.terminals.iter().map(|&f| if f { 1.0 } else { 0.0 }).collect()
 }
 
-/// Between scores and conditions, and under which scores rows are drawn.
+/// Between scores and conditions, which have mean 0 and variance 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct ScoreUnits {
     mean: f32,
     std: f32,
-    /// Rows are drawn under scores from here ...
-    from: f32,
-    /// ... to here.
-    to: f32,
 }
 
 impl ScoreUnits {
-    fn fit(scores: &[&[f32]], quantile: f64) -> Self {
-        let mut all = scores.concat();
-        let units = Standardizer::fit(&all, 1);
-        all.sort_by(f32::total_cmp);
-        // As numpy interpolates percentiles.
-        let at = quantile * (all.len() - 1) as f64;
-        let (low, high) = (all[at as usize] as f64, all[(at as usize + 1).min(all.len() - 1)] as f64);
-        let from = (low + at.fract() * (high - low)) as f32;
-        Self { mean: units.mean[0], std: units.std[0], from, to: all[all.len() - 1] }
+    fn fit(scores: &[&[f32]]) -> Self {
+        let units = Standardizer::fit(&scores.concat(), 1);
+        Self { mean: units.mean[0], std: units.std[0] }
     }
 
     /// The network's conditions of scores: standardised, and marked as present.
@@ -163,6 +157,24 @@ impl ScoreUnits {
         let standard: Vec<f32> = scores.iter().map(|s| (s - self.mean) / self.std).collect();
         present(&standard, 1)
     }
+}
+
+/// A score for each of `uniform` ∈ [0, 1): at or above the quantile `from` of `scores`.
+fn draw_scores(scores: &[&[f32]], from: f64, draw: ScoreDraw, uniform: &[f32]) -> Vec<f32> {
+    let mut all = scores.concat();
+    all.sort_by(f32::total_cmp);
+    // As numpy interpolates percentiles.
+    let quantile = |q: f64| {
+        let at = q * (all.len() - 1) as f64;
+        let (low, high) = (all[at as usize] as f64, all[(at as usize + 1).min(all.len() - 1)] as f64);
+        low + at.fract() * (high - low)
+    };
+    let (least, most) = (quantile(from), quantile(1.0));
+    let score = |&u: &f32| match draw {
+        ScoreDraw::Ranks => quantile(from + u as f64 * (1.0 - from)),
+        ScoreDraw::Values => least + u as f64 * (most - least),
+    };
+    uniform.iter().map(|u| score(u) as f32).collect()
 }
 
 /// What training the network leaves behind.
@@ -278,7 +290,7 @@ fn train(
     let (d, c) = (units.live.len(), 2);
     let on = scored.map(|s| {
         let scores = [s.source.as_slice(), s.target.as_slice()];
-        let units = ScoreUnits::fit(&scores, j.guidance.from);
+        let units = ScoreUnits::fit(&scores);
         (units, scores.map(|s| units.conditions(s)))
     });
     let data = match &on {
@@ -315,8 +327,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         network: String,
         sampler: tce_diffusion::Sampler,
         rows: usize,
-        /// w, the quantile, and whether rows are scored anew.
-        guidance: Option<(f64, f64, bool)>,
+        guidance: Option<GuidanceConfig>,
     }
     let (j, kind) = (&config.joint, config.mixture.generated);
     let scored = match kind {
@@ -324,7 +335,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         _ => None,
     };
     let (model, trained, network) = train(inputs, kind, j, scored.as_ref(), seeds, root, device)?;
-    let guidance = scored.as_ref().map(|_| (j.guidance.weight, j.guidance.from, j.guidance.rescore));
+    let guidance = scored.as_ref().map(|_| j.guidance.clone());
     let spec = Spec { network: network.name(), sampler: j.sampler, rows: j.rows, guidance };
     let stage = Stage::open(root, "stages/generated", &spec)?;
     if let Some(reports) = stage.summary::<Vec<Generated>>()? {
@@ -333,23 +344,17 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     let attempt = stage.attempt()?;
     let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
     let units = &trained.units;
-    let score_units = match &scored {
-        // Of the quantile that is asked for now: the network does not depend on it.
-        Some(s) => Some(ScoreUnits::fit(&[&s.source, &s.target], j.guidance.from)),
-        None => None,
-    };
     // Per member, under which scores its rows are drawn.
-    let drawn = |units: &ScoreUnits| -> Vec<Vec<f32>> {
-        let draw = |m: &Streams| uniform_labels(m, "joint", j.rows, 1.0);
-        let scale = |u: f32| units.from + u * (units.to - units.from);
-        members.iter().map(|m| draw(m).into_iter().map(scale).collect()).collect()
-    };
-    let under = score_units.as_ref().map(drawn);
-    let condition = match (&under, &score_units) {
+    let under = scored.as_ref().map(|s| -> Vec<Vec<f32>> {
+        let scores = [s.source.as_slice(), s.target.as_slice()];
+        let draw = |u: Vec<f32>| draw_scores(&scores, j.guidance.from, j.guidance.draw, &u);
+        members.iter().map(|m| draw(uniform_labels(m, "joint", j.rows, 1.0))).collect()
+    });
+    let condition = match (&under, &trained.scores) {
         (Some(scores), Some(units)) => units.conditions(&scores.concat()),
         _ => vec![0.0; 2 * j.rows],
     };
-    let guidance = guidance.map(|g| g.0).filter(|w| *w != 1.0);
+    let guidance = under.as_ref().map(|_| j.guidance.weight).filter(|w| *w != 1.0);
     let start =
         start_rows(model.process(), || units.encode(&inputs.target.rows), units.live.len(), j.rows, &members, "joint");
     let kept = Some(Chunks { directory: attempt.directory(), key: attempt.key() });
@@ -468,11 +473,19 @@ mod tests {
         assert_eq!(back.terminals[1..3], [false, true]);
     }
 
+    /// Of 0, .0001, ..., .0099 and 1, the ranks from .9 on hold one 1 in ten, the values from .009 on mostly what no row has.
     #[test]
     fn rows_are_drawn_under_the_best_scores() {
+        let few: Vec<f32> = (0..100).map(|i| i as f32 / 1e4).chain([1.0]).collect();
+        let uniform: Vec<f32> = (0..1000).map(|i| i as f32 / 1e3).collect();
+        let draw = |by| draw_scores(&[&few[..50], &few[50..]], 0.9, by, &uniform);
+        let (ranks, values) = (draw(ScoreDraw::Ranks), draw(ScoreDraw::Values));
+        assert!((ranks[0] - 0.009).abs() < 1e-6 && (values[0] - 0.009).abs() < 1e-6);
+        let above = |x: &[f32]| x.iter().filter(|x| **x > 0.01).count();
+        assert_eq!((above(&ranks), above(&values)), (99, 998));
+
         let scores: Vec<f32> = (0..=100).map(|i| i as f32 / 100.0).collect();
-        let units = ScoreUnits::fit(&[&scores[..50], &scores[50..]], 0.905);
-        assert!((units.from - 0.905).abs() < 1e-6 && units.to == 1.0, "{units:?}");
+        let units = ScoreUnits::fit(&[&scores[..50], &scores[50..]]);
         let on = units.conditions(&[units.mean, units.mean + units.std]);
         assert!(on[0].abs() < 1e-6 && (on[2] - 1.0).abs() < 1e-5 && (on[1], on[3]) == (1.0, 1.0), "{on:?}");
     }
