@@ -240,7 +240,9 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
                 first.what,
                 first.why
             ),
-            None => "found no finished run, expected at least one; make some with `tce sweep launch` or `tce run`".into(),
+            None => {
+                "found no finished run, expected at least one; make some with `tce sweep launch` or `tce run`".into()
+            }
         };
         return Err(ReportError::Nothing { path: study.directory.clone().into(), what });
     }
@@ -268,9 +270,7 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
     let published: Vec<bool> = study
         .methods
         .iter()
-        .map(|m| {
-            m.variant.ends_with("-published") || study.runs.iter().any(|r| r.method == m.id && r.folder.published)
-        })
+        .map(|m| m.variant.ends_with("-published") || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
         .collect();
     let warnings = warnings(study, &tasks, &scores, comparison.as_ref(), &published);
     Ok(Analysis {
@@ -388,9 +388,8 @@ fn compare(
     let count = |m: usize| (0..tasks.len()).filter(|t| has(*t, m)).count();
     let mut kept: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) > 0).collect();
     let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
-    let shared = |kept: &[usize]| -> Vec<usize> {
-        (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect()
-    };
+    let shared =
+        |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
     while shared(&kept).is_empty() {
         let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].floor, std::cmp::Reverse(**m)))
         else {
@@ -518,7 +517,10 @@ fn warnings(
     let unscored = cases(&|r| (r.member.verdict == Verdict::Unscored).then(|| "no score".into()));
     if !unscored.is_empty() {
         let n = plural(unscored.len(), "run has", "runs have");
-        warn(format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."), unscored);
+        warn(
+            format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
+            unscored,
+        );
     }
     let modes: Vec<&str> = (0..published.len()).filter(|m| published[*m]).map(title).collect();
     if !modes.is_empty() {
@@ -603,10 +605,7 @@ fn warnings(
                     warn(format!("Below the best floor ({}): {}.", title(floor), list(worse)), Vec::new());
                 }
                 if !open.is_empty() {
-                    warn(
-                        format!("Not shown to beat the best floor ({}): {}.", title(floor), list(open)),
-                        Vec::new(),
-                    );
+                    warn(format!("Not shown to beat the best floor ({}): {}.", title(floor), list(open)), Vec::new());
                 }
             }
         }

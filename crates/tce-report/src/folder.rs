@@ -241,7 +241,13 @@ fn curves(path: &Path, members: usize) -> Result<Vec<Curves>> {
             Err(_) if n + 1 == lines.len() => break,
             Err(e) => {
                 let field = format!("(line {})", n + 1);
-                return Err(ReportError::field(path, field, e.to_string(), "one JSON object a line", "remove the file"));
+                return Err(ReportError::field(
+                    path,
+                    field,
+                    e.to_string(),
+                    "one JSON object a line",
+                    "remove the file",
+                ));
             }
         };
         let wrong = |field: &str, expected: &str| {

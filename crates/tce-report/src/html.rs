@@ -62,7 +62,9 @@ fn one(value: f64) -> String {
 }
 
 fn range(interval: Option<(f64, f64)>, decimals: usize) -> String {
-    interval.map_or_else(String::new, |(low, high)| minus(format!("[{low:.decimals$}")) + &minus(format!(", {high:.decimals$}]")))
+    interval.map_or_else(String::new, |(low, high)| {
+        minus(format!("[{low:.decimals$}")) + &minus(format!(", {high:.decimals$}]"))
+    })
 }
 
 fn estimate(e: &Estimate, decimals: usize) -> Markup {
@@ -573,7 +575,8 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
     let scores = lines("evaluate/score", &|v| v);
     let on_the_way = scores.iter().flat_map(|(_, l)| l).any(|l| l.points.len() > 1);
     let everything = lines("learn/policy_loss", &|v| v);
-    let positive = everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.2.map_or(p.1, |b| b.0) > 0.0);
+    let positive =
+        everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.2.map_or(p.1, |b| b.0) > 0.0);
     let losses = if positive { lines("learn/policy_loss", &f64::log10) } else { everything };
     let several = tasks.iter().map(|t| t.shift).collect::<BTreeSet<_>>().len() > 1;
     let panels = |figures: &[(Task, Vec<Line>)], y_unit: &str, log: bool| {

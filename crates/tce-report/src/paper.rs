@@ -172,12 +172,8 @@ mod tests {
 
     #[test]
     fn single_figures_are_found() {
-        let task = Task {
-            agent: Agent::Hopper,
-            shift: Shift::Morph,
-            source: Quality::MediumReplay,
-            target: Quality::Medium,
-        };
+        let task =
+            Task { agent: Agent::Hopper, shift: Shift::Morph, source: Quality::MediumReplay, target: Quality::Medium };
         let morph = table(Shift::Morph).unwrap();
         let og = morph.row(&task).unwrap()[morph.column("TCE(OG)").unwrap()];
         assert_eq!(og, Some(Printed { mean: 49.5, std: 0.1 }));

@@ -143,7 +143,8 @@ impl Scores {
 
     /// As many runs, drawn with replacement within every task; `order` tells which task stands in each place.
     fn resample(&self, order: Option<&[usize]>, rng: &mut Rng) -> Self {
-        let of = |task: &Vec<f64>, rng: &mut Rng| (0..task.len()).map(|_| task[rng.random_range(0..task.len())]).collect();
+        let of =
+            |task: &Vec<f64>, rng: &mut Rng| (0..task.len()).map(|_| task[rng.random_range(0..task.len())]).collect();
         let tasks = match order {
             None => self.tasks.iter().map(|t| of(t, rng)).collect(),
             Some(order) => order.iter().map(|&k| of(&self.tasks[k], rng)).collect(),
@@ -223,8 +224,8 @@ impl Bootstrap {
         }
         let one = |k: usize| {
             let mut rng = self.streams.indexed(&format!("report/bootstrap/{name}"), k as u64);
-            let order: Option<Vec<usize>> = (draw == Draw::TasksAndRuns)
-                .then(|| (0..tasks).map(|_| rng.random_range(0..tasks)).collect());
+            let order: Option<Vec<usize>> =
+                (draw == Draw::TasksAndRuns).then(|| (0..tasks).map(|_| rng.random_range(0..tasks)).collect());
             let drawn: Vec<Scores> = samples.iter().map(|s| s.resample(order.as_deref(), &mut rng)).collect();
             statistics(&drawn.iter().collect::<Vec<_>>())
         };
@@ -325,6 +326,22 @@ mod tests {
         let improvement = |s: &[&Scores]| vec![probability_of_improvement(s[0], s[1])];
         let found = bootstrap(20_000).intervals("test", Draw::Runs, &[&x, &y], improvement).unwrap();
         close(&found, &[(0.466_666_7, 0.816_666_7)], 0.011);
+    }
+
+    /// `rliable.library.create_performance_profile(..., reps=2000)` at four thresholds.
+    #[test]
+    fn profiles_are_those_of_rliable() {
+        let of = |s: &[&Scores]| [0.0, 25.0, 50.0, 75.0].map(|t| s[0].share_above(t)).to_vec();
+        let x = bootstrap(5000).intervals("test", Draw::Runs, &[&by_task(&X)], of).unwrap();
+        for (found, expected) in x.iter().zip([0.95, 0.8, 0.45, 0.1]) {
+            assert!((found.point - expected).abs() < 1e-12);
+        }
+        close(&x, &[(0.85, 1.0), (0.65, 0.95), (0.35, 0.5), (0.0, 0.2)], 0.051);
+        let y = bootstrap(5000).intervals("test", Draw::Runs, &[&by_task(&Y)], of).unwrap();
+        for (found, expected) in y.iter().zip([1.0, 11.0 / 12.0, 1.0 / 3.0, 1.0 / 12.0]) {
+            assert!((found.point - expected).abs() < 1e-12);
+        }
+        close(&y, &[(1.0, 1.0), (0.75, 1.0), (0.25, 0.5), (0.0, 0.25)], 0.084);
     }
 
     /// scipy.stats.trim_mean(range, 0.25) for lengths that are no multiples of four.

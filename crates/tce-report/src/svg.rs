@@ -66,7 +66,8 @@ impl Axis {
         let step = self.ticks.get(1).map_or(1.0, |t| (t - self.ticks[0]).abs());
         let decimals = if step >= 0.999 && step.fract() < 1e-9 { 0 } else { (-step.log10().floor()).max(1.0) as usize };
         // A step of 2.5 has one more digit than its magnitude says.
-        let decimals = if step < 0.999 && (step * 10f64.powi(decimals as i32)).fract() > 1e-6 { decimals + 1 } else { decimals };
+        let decimals =
+            if step < 0.999 && (step * 10f64.powi(decimals as i32)).fract() > 1e-6 { decimals + 1 } else { decimals };
         match value.abs() {
             v if v >= 1e6 => format!("{:.3e}", value),
             v if v >= 10_000.0 => format!("{}k", (value / 1000.0 * 10.0).round() / 10.0),
@@ -99,7 +100,14 @@ fn spoken(e: &Estimate, decimals: usize) -> String {
 }
 
 /// Dots with intervals, one row each; `mark` is a value to compare with, drawn as a dashed line.
-pub fn intervals(label: &str, rows: &[Interval], axis: &Axis, unit: &str, mark: Option<f64>, decimals: usize) -> Markup {
+pub fn intervals(
+    label: &str,
+    rows: &[Interval],
+    axis: &Axis,
+    unit: &str,
+    mark: Option<f64>,
+    decimals: usize,
+) -> Markup {
     const WIDTH: f64 = 400.0;
     const ROW: f64 = 25.0;
     let (left, right, top) = (138.0, WIDTH - 46.0, 8.0);
@@ -255,6 +263,9 @@ mod tests {
     #[test]
     fn quarter_steps_keep_their_digits() {
         let axis = Axis::around([0.0, 1.0], 4);
-        assert_eq!(axis.ticks.iter().map(|t| axis.label(*t)).collect::<Vec<_>>(), ["0", "0.25", "0.50", "0.75", "1.00"]);
+        assert_eq!(
+            axis.ticks.iter().map(|t| axis.label(*t)).collect::<Vec<_>>(),
+            ["0", "0.25", "0.50", "0.75", "1.00"]
+        );
     }
 }

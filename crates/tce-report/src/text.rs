@@ -154,7 +154,8 @@ pub fn latex(study: &Study, analysis: &Analysis) -> String {
         out += &format!("% Note: {}\n", w.text.replace(['\n', '\r'], " "));
     }
     for t in tables(analysis) {
-        let line = |cells: &[String]| format!("  {} \\\\\n", cells.iter().map(|c| tex(c)).collect::<Vec<_>>().join(" & "));
+        let line =
+            |cells: &[String]| format!("  {} \\\\\n", cells.iter().map(|c| tex(c)).collect::<Vec<_>>().join(" & "));
         out += &format!(
             "\n\\begin{{table}}[t]\n\\centering\n\\caption{{{}: {}. {}}}\n\\resizebox{{\\linewidth}}{{!}}{{%\n\\begin{{tabular}}{{l{}}}\n\\toprule\n",
             tex(&study.name),

@@ -20,6 +20,7 @@ mod output;
 mod pipeline;
 mod stage;
 mod stand_ins;
+mod study;
 mod sweep;
 mod task;
 mod units;
