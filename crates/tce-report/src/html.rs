@@ -143,7 +143,7 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
                 li { b { (analysis.methods.len() - floors) " + " (floors) } "methods + floors" }
                 li { b { (seeds.len()) } (if seeds.len() == 1 { "seed" } else { "seeds" }) }
                 li { b { (study.runs.len()) " / " (all) } "runs with a result" }
-                li { b { (duration(hours)) } "of runs" }
+                li { b { (duration(hours)) } "run time in all" }
             }
         }
     }
@@ -179,6 +179,7 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
     let title = |m: usize| analysis.methods[m].title.as_str();
     let percent = (100.0 * analysis.level).round();
     let floor = c.best_floor().and_then(|m| c.methods.iter().find(|a| a.method == m));
+    let others: Vec<usize> = (0..c.floors.len()).filter(|k| Some(*k) != c.best_floor).collect();
     let sentence = |a: &Aggregate| -> Option<String> {
         let (p, finding) = c.improvement(a)?;
         let closing = match finding {
@@ -189,7 +190,7 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
         };
         let [iqm, ..] = a.over_seeds;
         Some(format!(
-            "{}: interquartile mean {}. A run of it outscores a run of the best floor with probability {}; {closing}",
+            "{}: interquartile mean {}. One of its runs outscores one of the best floor's with probability {}; {closing}",
             title(a.method),
             said(&iqm, 1),
             said(&p, 2),
@@ -204,51 +205,56 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
             }
             "Brackets hold " (percent) " % intervals."
         }
-        ul { @for text in c.methods.iter().filter_map(sentence) { li { (text) } } }
+        ul class="said" { @for text in c.methods.iter().filter_map(sentence) { li { (text) } } }
         div class="scroll" {
             table {
                 thead {
                     tr class="groups" {
                         th class="first" {}
-                        th colspan="5" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
-                        @if !c.floors.is_empty() {
-                            th class="edge" colspan=(c.floors.len() + 1) { "Probability of outscoring a floor" }
+                        th colspan="2" {}
+                        @if let Some(f) = floor {
+                            th class="edge" colspan="2" { "Against the best floor, " (title(f.method)) }
+                        }
+                        th class="edge" colspan="3" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
+                        @if !others.is_empty() {
+                            th class="edge" colspan=(others.len()) { "Probability of outscoring the other floors" }
                         }
                     }
                     tr {
                         th class="first" { "Method" }
-                        th { "Runs" } th { "Interquartile mean" } th { "Mean" } th { "Median" } th { "Total" }
-                        @for (k, f) in c.floors.iter().enumerate() {
-                            th class=[(k == 0).then_some("edge")] {
-                                (title(*f)) @if Some(k) == c.best_floor { " " small { "(best)" } }
-                            }
+                        th { "Runs" } th { "Interquartile mean" }
+                        @if floor.is_some() { th class="edge" { "Outscores it" } th class="text" { "Finding" } }
+                        th class="edge" { "Mean" } th { "Median" } th { "Total" }
+                        @for (n, k) in others.iter().enumerate() {
+                            th class=[(n == 0).then_some("edge")] { (title(c.floors[*k])) }
                         }
-                        @if !c.floors.is_empty() { th class="text" { "Against the best" } }
                     }
                 }
                 tbody {
                     @for a in &c.methods {
-                        tr class=[(!analysis.methods[a.method].floor).then_some("method")] {
+                        tr {
                             th scope="row" { (title_cell(analysis, a.method)) }
                             td { (a.runs) }
                             td { (estimate(&a.over_seeds[0], 1)) }
-                            td { (estimate(&a.over_seeds[2], 1)) }
+                            @match (floor, c.improvement(a)) {
+                                (None, _) => {}
+                                (_, Some((e, finding))) => {
+                                    td class="edge" { (estimate(&e, 2)) }
+                                    td class=(format!("text {}", match finding {
+                                        Finding::Better => "better", Finding::Worse => "worse", _ => "",
+                                    })) { (finding.word()) }
+                                }
+                                (Some(f), None) => {
+                                    td class="edge" { "–" }
+                                    td class="text" { @if f.method == a.method { "the best floor" } @else { "floor" } }
+                                }
+                            }
+                            td class="edge" { (estimate(&a.over_seeds[2], 1)) }
                             td { (estimate(&a.over_seeds[1], 1)) }
                             td { (estimate(&a.total, 1)) }
-                            @match &a.over_floors {
-                                Some(over) => {
-                                    @for (k, e) in over.iter().enumerate() {
-                                        td class=[(k == 0).then_some("edge")] { (estimate(e, 2)) }
-                                    }
-                                    @if let Some((_, finding)) = c.improvement(a) {
-                                        td class=(format!("text {}", match finding {
-                                            Finding::Better => "better", Finding::Worse => "worse", _ => "",
-                                        })) { (finding.word()) }
-                                    }
-                                }
-                                None => {
-                                    @for k in 0..c.floors.len() { td class=[(k == 0).then_some("edge")] { "–" } }
-                                    @if !c.floors.is_empty() { td class="text" { "floor" } }
+                            @for (n, k) in others.iter().enumerate() {
+                                td class=[(n == 0).then_some("edge")] {
+                                    @match &a.over_floors { Some(over) => (estimate(&over[*k], 2)), None => "–" }
                                 }
                             }
                         }
@@ -323,31 +329,52 @@ fn tables(analysis: &Analysis) -> Markup {
     }
 }
 
+/// A column of a shift's table: a method of ours, or one of the paper's.
+#[derive(Clone, Copy)]
+enum Column {
+    Ours(usize),
+    Paper(usize),
+}
+
 fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
     let methods = &analysis.methods;
-    let floors = methods.iter().filter(|m| m.floor).count();
-    let others = methods.len() - floors;
-    let columns = t.paper.map_or(&[][..], |p| &p.columns[..]);
-    let numbers: Vec<&str> = columns.iter().fold(Vec::new(), |mut all, c| {
-        if !all.contains(&c.table.as_str()) {
-            all.push(&c.table);
-        }
-        all
-    });
-    let edge = |k: usize, first: usize| if k == first { "edge" } else { "" };
-    let paper_class = |k: usize| format!("from-paper {}", edge(k, 0)).trim_end().to_owned();
-    let total = |total: &Option<Total>, class: &str| {
-        html! {
-            td class=(class) {
-                @match total {
-                    None => "–",
-                    Some(total) => {
-                        (estimate(&total.estimate, 1))
-                        @if total.tasks < t.rows.len() { br; small { "of " (counted(total.tasks, "task", "tasks")) } }
-                    }
+    let papers = t.paper.map_or(&[][..], |p| &p.columns[..]);
+    // The paper's figures for a method stand right beside ours, the rest of the paper behind them.
+    let mut beside: Vec<Column> = Vec::new();
+    let mut used: BTreeSet<usize> = BTreeSet::new();
+    for m in (0..methods.len()).filter(|m| !methods[*m].floor) {
+        beside.push(Column::Ours(m));
+        let name = t.against.iter().find(|a| a.method == m).map(|a| a.paper_method.as_str());
+        let column = name.and_then(|name| t.paper?.column(name)).filter(|c| used.insert(*c));
+        beside.extend(column.map(Column::Paper));
+    }
+    let groups: [(&str, Vec<Column>); 3] = [
+        ("Floors", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
+        (if used.is_empty() { "Methods" } else { "Methods, ours and the paper's" }, beside),
+        ("Others in the paper", (0..papers.len()).filter(|c| !used.contains(c)).map(Column::Paper).collect()),
+    ];
+    let columns: Vec<(Column, String)> = groups
+        .iter()
+        .flat_map(|(_, columns)| columns.iter().enumerate())
+        .map(|(k, c)| {
+            let class = if let Column::Paper(_) = c { "from-paper" } else { "" };
+            (*c, format!("{class}{}", if k == 0 { " edge" } else { "" }).trim().to_owned())
+        })
+        .collect();
+    let of = |n: usize| html! { @if n < t.rows.len() { br; small { "of " (counted(n, "task", "tasks")) } } };
+    let total = |c: Column| match c {
+        Column::Ours(m) => html! {
+            @match &t.totals[m] {
+                None => "–",
+                Some(Total { estimate, tasks }) => {
+                    (one(estimate.point)) br; small { (range(estimate.interval, 1)) } (of(*tasks))
                 }
             }
-        }
+        },
+        Column::Paper(c) => match t.paper_totals[c] {
+            (_, 0) => html! { "–" },
+            (sum, n) => html! { (one(sum)) (of(n)) },
+        },
     };
     html! {
         h3 { (shift_title(t.shift)) }
@@ -356,59 +383,55 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                 thead {
                     tr class="groups" {
                         th class="first" {}
-                        @if floors > 0 { th class="edge" colspan=(floors) { "Floors" } }
-                        @if others > 0 { th class="edge" colspan=(others) { "Methods" } }
-                        @if !columns.is_empty() {
-                            th class="edge from-paper" colspan=(columns.len()) {
-                                "Paper, " (if numbers.len() == 1 { "Table " } else { "Tables " }) (numbers.join(", "))
-                            }
+                        @for (title, columns) in groups.iter().filter(|(_, c)| !c.is_empty()) {
+                            th class="edge" colspan=(columns.len()) { (title) }
                         }
                     }
                     tr {
                         th class="first" { "Task" }
-                        @for m in 0..methods.len() {
-                            th class=(if m == 0 { "edge" } else { edge(m, floors) }) { (title_cell(analysis, m)) }
-                        }
-                        @for (k, c) in columns.iter().enumerate() {
-                            th class=(paper_class(k)) { (c.method) }
+                        @for (c, class) in &columns {
+                            th class=(class) {
+                                @match *c {
+                                    Column::Ours(m) => (title_cell(analysis, m)),
+                                    Column::Paper(c) if used.contains(&c) => { small { "paper, Table " (papers[c].table) } }
+                                    Column::Paper(c) => { (papers[c].method) br; small { "Table " (papers[c].table) } }
+                                }
+                            }
                         }
                     }
                 }
                 tbody {
                     @for (r, row) in t.rows.iter().enumerate() {
-                        @let breaks = r > 0 && (row.task.agent, row.task.source) != (t.rows[r - 1].task.agent, t.rows[r - 1].task.source);
-                        tr class=[breaks.then_some("break")] {
-                            th scope="row" { (row.task.short()) }
-                            @for (m, c) in row.cells.iter().enumerate() {
-                                (cell(c.as_ref(), if m == 0 { "edge" } else { edge(m, floors) }))
+                        @let before = r.checked_sub(1).map(|k| t.rows[k].task);
+                        @if before.is_none_or(|b| b.agent != row.task.agent) {
+                            tr class="group" {
+                                th { (agent_title(row.task.agent)) }
+                                @for (_, class) in &columns { td class=(class) {} }
                             }
-                            @for (k, p) in row.paper.iter().enumerate() {
-                                td class=(paper_class(k)) {
-                                    @match p { None => "–", Some(p) => { (one(p.mean)) small { " ±" (one(p.std)) } } }
+                        }
+                        tr class=[before.is_some_and(|b| b.agent == row.task.agent && b.source != row.task.source).then_some("break")] {
+                            th scope="row" { (row.task.source) " → " (row.task.target) }
+                            @for (c, class) in &columns {
+                                @match *c {
+                                    Column::Ours(m) => (cell(row.cells[m].as_ref(), class)),
+                                    Column::Paper(c) => td class=(class) {
+                                        @match row.paper[c] { None => "–", Some(p) => { (one(p.mean)) small { " ±" (one(p.std)) } } }
+                                    }
                                 }
                             }
                         }
                     }
                     tr class="sum" {
                         th scope="row" { "Total" }
-                        @for (m, x) in t.totals.iter().enumerate() {
-                            (total(x, if m == 0 { "edge" } else { edge(m, floors) }))
-                        }
-                        @for (k, (sum, n)) in t.paper_totals.iter().enumerate() {
-                            td class=(paper_class(k)) {
-                                @if *n == 0 { "–" } @else {
-                                    (one(*sum))
-                                    @if *n < t.rows.len() { br; small { "of " (counted(*n, "task", "tasks")) } }
-                                }
-                            }
-                        }
+                        @for (c, class) in &columns { td class=(class) { (total(*c)) } }
                     }
                     @if t.paper.is_some_and(|p| p.rows.len() == t.rows.len()) {
                         tr {
-                            th scope="row" { "Total as printed" }
-                            @for m in 0..methods.len() { td class=(if m == 0 { "edge" } else { edge(m, floors) }) {} }
-                            @for (k, c) in columns.iter().enumerate() {
-                                td class=(paper_class(k)) { (c.total.map_or("–".into(), one)) }
+                            th scope="row" { "as printed" }
+                            @for (c, class) in &columns {
+                                td class=(class) {
+                                    @if let Column::Paper(c) = *c { (papers[c].total.map_or("–".into(), one)) }
+                                }
                             }
                         }
                     }
@@ -512,7 +535,7 @@ fn statistics(analysis: &Analysis) -> Markup {
                 (svg::lines(&Frame {
                     label: "Performance profiles",
                     size: (440.0, 300.0),
-                    x: ("normalised score", Axis::around(ends, 6)),
+                    x: ("normalised score", Axis::within(ends, 6)),
                     y: ("share of runs, %", Axis::fixed(0.0, 100.0, &[0.0, 25.0, 50.0, 75.0, 100.0])),
                     log: false,
                 }, &profile))
@@ -589,12 +612,12 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
                     figure {
                         figcaption {
                             (task.short())
-                            @if several { " " span { (shift_title(task.shift)) } }
+                            @if several { br; span { (shift_title(task.shift)) } }
                         }
                         (svg::lines(&Frame {
                             label: &format!("{y_unit}, {task}"),
                             size: (320.0, 210.0),
-                            x: ("update steps", Axis::around(points().map(|p| p.0).chain([0.0]), 4)),
+                            x: ("update steps", Axis::within(points().map(|p| p.0).chain([0.0]), 4)),
                             y: (y_unit, y),
                             log,
                         }, lines))

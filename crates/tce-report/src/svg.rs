@@ -53,6 +53,18 @@ impl Axis {
         Self { low: ticks[0], high: ticks[count], ticks }
     }
 
+    /// An axis that ends where `values` end, with the round ticks in between.
+    pub fn within(values: impl IntoIterator<Item = f64>, n: usize) -> Self {
+        let values: Vec<f64> = values.into_iter().filter(|v| v.is_finite()).collect();
+        let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        let mut axis = Self::around(values, n);
+        if high > low {
+            axis.ticks.retain(|t| (low..=high).contains(t));
+            (axis.low, axis.high) = (low, high);
+        }
+        axis
+    }
+
     /// From `low` to `high` with the given ticks.
     pub fn fixed(low: f64, high: f64, ticks: &[f64]) -> Self {
         Self { low, high, ticks: ticks.to_vec() }
@@ -135,7 +147,7 @@ pub fn intervals(
                     @if let Some((low, high)) = row.inner.interval {
                         line class="thick" x1=(n(x(low))) x2=(n(x(high))) y1=(n(y)) y2=(n(y)) {}
                     }
-                    circle cx=(n(x(row.inner.point))) cy=(n(y)) r="4.5" {}
+                    circle cx=(n(x(row.inner.point))) cy=(n(y)) r="3.6" {}
                     text class="value" x=(n(WIDTH - 2.0)) y=(n(y + 4.0)) text-anchor="end" {
                         (minus(format!("{:.decimals$}", row.inner.point)))
                     }
