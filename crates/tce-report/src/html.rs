@@ -3,13 +3,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use tce_data::{Agent, Shift};
 
 use crate::analysis::{Aggregate, Analysis, Cell, Comparison, Finding, ShiftTable, Total, score};
 use crate::folder::Verdict;
 use crate::paper;
 use crate::stats::Estimate;
 use crate::study::{Cost, Run, Study, Task, agent_title, shift_title};
-use crate::svg::{self, Axis, Frame, Interval, Line, Series, minus};
+use crate::svg::{self, Axis, Frame, Interval, Line, Point, Series, minus};
 
 /// Points of a curve; more would be finer than the pixels.
 const CURVE_POINTS: usize = 60;
@@ -113,7 +114,10 @@ pub(crate) fn headline(analysis: &Analysis) -> String {
     let better: Vec<&str> = judged.iter().filter(|j| j.1 == Finding::Better).map(|j| title(j.0)).collect();
     let floor = title(floor);
     match (judged.len(), better.len()) {
-        (0, _) => format!("Only floors were run; the best of them is {floor}."),
+        (0, _) if analysis.methods.iter().all(|m| m.floor) => {
+            format!("Only floors were run; the best of them is {floor}.")
+        }
+        (0, _) => "No method can be compared with the floors: they share no task with scores.".into(),
         (1, 1) => format!("{} beats the best floor, {floor}.", better[0]),
         (1, _) => format!("{} is not shown to beat the best floor, {floor}.", title(judged[0].0)),
         (n, 0) => format!("None of the {n} methods is shown to beat the best floor, {floor}."),
@@ -268,7 +272,7 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
 
 /// Table 3 of the paper beside ours, where all 36 morphology tasks are there.
 fn components(study: &Study, analysis: &Analysis, c: &Comparison) -> Markup {
-    let whole = c.tasks.len() == 36 && c.tasks.iter().all(|t| t.shift == tce_data::Shift::Morph);
+    let whole = c.tasks.len() == 36 && c.tasks.iter().all(|t| t.shift == Shift::Morph);
     let pairs: Vec<_> = c
         .methods
         .iter()
@@ -410,7 +414,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                             }
                         }
                         tr class=[before.is_some_and(|b| b.agent == row.task.agent && b.source != row.task.source).then_some("break")] {
-                            th scope="row" { (row.task.source) " → " (row.task.target) }
+                            th scope="row" { span class="nb" { (row.task.source) " →" } " " span class="nb" { (row.task.target) } }
                             @for (c, class) in &columns {
                                 @match *c {
                                     Column::Ours(m) => (cell(row.cells[m].as_ref(), class)),
@@ -512,7 +516,10 @@ fn statistics(analysis: &Analysis) -> Markup {
                 .thresholds
                 .iter()
                 .zip(&a.profile)
-                .map(|(t, e)| (*t, 100.0 * e.point, e.interval.map(|(l, h)| (100.0 * l, 100.0 * h))))
+                .map(|(t, e)| {
+                    let band = e.interval.map(|(l, h)| (100.0 * l, 100.0 * h));
+                    Point { x: *t, y: 100.0 * e.point, band }
+                })
                 .collect(),
         })
         .collect();
@@ -558,7 +565,7 @@ fn percent(analysis: &Analysis) -> String {
 }
 
 /// Mean and extremes over seeds, at steps that all of them have, at most [`CURVE_POINTS`] of them.
-fn mean_curve(curves: &[&[(f64, f64)]], map: impl Fn(f64) -> f64) -> Vec<(f64, f64, Option<(f64, f64)>)> {
+fn mean_curve(curves: &[&[(f64, f64)]], map: impl Fn(f64) -> f64) -> Vec<Point> {
     let mut at: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for &(step, value) in curves.iter().copied().flatten() {
         let value = map(value);
@@ -574,7 +581,7 @@ fn mean_curve(curves: &[&[(f64, f64)]], map: impl Fn(f64) -> f64) -> Vec<(f64, f
     kept.map(|(_, (step, values))| {
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-        (step as f64, mean, (values.len() > 1).then_some((low, high)))
+        Point { x: step as f64, y: mean, band: (values.len() > 1).then_some((low, high)) }
     })
     .collect()
 }
@@ -598,8 +605,7 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
     let scores = lines("evaluate/score", &|v| v);
     let on_the_way = scores.iter().flat_map(|(_, l)| l).any(|l| l.points.len() > 1);
     let everything = lines("learn/policy_loss", &|v| v);
-    let positive =
-        everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.2.map_or(p.1, |b| b.0) > 0.0);
+    let positive = everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.range().0 > 0.0);
     let losses = if positive { lines("learn/policy_loss", &f64::log10) } else { everything };
     let several = tasks.iter().map(|t| t.shift).collect::<BTreeSet<_>>().len() > 1;
     let panels = |figures: &[(Task, Vec<Line>)], y_unit: &str, log: bool| {
@@ -607,7 +613,7 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
             div class="panels small" {
                 @for (task, lines) in figures {
                     @let points = || lines.iter().flat_map(|l| &l.points);
-                    @let heights = points().flat_map(|p| { let (l, h) = p.2.unwrap_or((p.1, p.1)); [p.1, l, h] });
+                    @let heights = points().flat_map(|p| [p.y, p.range().0, p.range().1]);
                     @let y = if log { decades(heights) } else { Axis::around(heights, 4) };
                     figure {
                         figcaption {
@@ -617,7 +623,7 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
                         (svg::lines(&Frame {
                             label: &format!("{y_unit}, {task}"),
                             size: (320.0, 210.0),
-                            x: ("update steps", Axis::within(points().map(|p| p.0).chain([0.0]), 4)),
+                            x: ("update steps", Axis::within(points().map(|p| p.x).chain([0.0]), 5)),
                             y: (y_unit, y),
                             log,
                         }, lines))
@@ -681,17 +687,24 @@ fn bytes(memory: u64) -> String {
 }
 
 fn cost(study: &Study) -> Markup {
-    let mut groups: Vec<((&str, tce_data::Agent, usize), Vec<&Cost>)> = Vec::new();
+    // Groups of one stage together, in the order in which stages come; agents in the paper's.
+    let mut stages: Vec<&str> = Vec::new();
+    let mut groups: BTreeMap<(usize, Option<usize>, usize), Vec<&Cost>> = BTreeMap::new();
     for cost in &study.costs {
-        let key = (cost.stage.as_str(), cost.agent, cost.seeds);
-        match groups.iter_mut().find(|(k, _)| *k == key) {
-            Some((_, list)) => list.push(cost),
-            None => groups.push((key, vec![cost])),
-        }
+        let stage = stages.iter().position(|s| *s == cost.stage).unwrap_or_else(|| {
+            stages.push(&cost.stage);
+            stages.len() - 1
+        });
+        let agent = Agent::ALL.iter().position(|a| *a == cost.agent);
+        groups.entry((stage, agent, cost.seeds)).or_default().push(cost);
     }
+    let groups: Vec<Vec<&Cost>> = groups.into_values().collect();
     let paper = paper::runtime();
     html! {
-        p { "Seconds on the clock of single pieces of work, on whatever machine did them and whatever else ran there." }
+        p {
+            "Times on the clock of single pieces of work, on whatever machine did them and whatever else ran there. Memory is the most \
+             that the process had at a time; where one process trained the networks and sampled from them, it stands with the sampling."
+        }
         @if groups.is_empty() { p class="note" { "No stage has a time." } } @else {
             div class="scroll" {
                 table {
@@ -702,11 +715,13 @@ fn cost(study: &Study) -> Markup {
                         }
                     }
                     tbody {
-                        @for (k, ((stage, agent, seeds), list)) in groups.iter().enumerate() {
+                        @for (k, list) in groups.iter().enumerate() {
                             @let mut times: Vec<f64> = list.iter().map(|c| c.seconds).collect();
                             @let () = times.sort_by(f64::total_cmp);
-                            tr class=[(k > 0 && groups[k - 1].0.0 != *stage).then_some("break")] {
-                                th scope="row" { (stage) }
+                            @let Cost { stage, agent, seeds, .. } = list[0];
+                            @let first = k == 0 || groups[k - 1][0].stage != *stage;
+                            tr class=[first.then_some("break")] {
+                                th scope="row" { @if first { (stage) } }
                                 td class="text" { (agent_title(*agent)) }
                                 td { (seeds) } td { (list.len()) }
                                 td { (duration(crate::stats::quantile(&times, 0.5))) }

@@ -158,13 +158,31 @@ pub fn intervals(
     }
 }
 
+/// A point of a line.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Point {
+    /// Its place.
+    pub x: f64,
+    /// Its value.
+    pub y: f64,
+    /// The band around the value.
+    pub band: Option<(f64, f64)>,
+}
+
+impl Point {
+    /// The ends of the band, or the value twice.
+    pub fn range(&self) -> (f64, f64) {
+        self.band.unwrap_or((self.y, self.y))
+    }
+}
+
 /// A line with its band.
 #[derive(Clone, Debug)]
 pub struct Line {
     /// What it is of.
     pub series: Series,
-    /// Points: place, value, and the band around it.
-    pub points: Vec<(f64, f64, Option<(f64, f64)>)>,
+    /// In ascending order of places.
+    pub points: Vec<Point>,
 }
 
 /// Size and words of a [`lines`] figure.
@@ -194,7 +212,7 @@ pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
         points.map(|(a, b)| format!("{},{}", n(x(a)), n(y(b)))).collect::<Vec<_>>().join(" ")
     };
     let band = |line: &Line| -> Option<String> {
-        let bands: Vec<(f64, (f64, f64))> = line.points.iter().filter_map(|p| Some((p.0, p.2?))).collect();
+        let bands: Vec<(f64, (f64, f64))> = line.points.iter().filter_map(|p| Some((p.x, p.band?))).collect();
         let there = bands.iter().map(|b| (b.0, b.1.1));
         (bands.len() > 1).then(|| path(&mut there.chain(bands.iter().rev().map(|b| (b.0, b.1.0)))))
     };
@@ -219,10 +237,10 @@ pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
             @for line in lines {
                 g class=(format!("mark {}", line.series.class)) {
                     title { (line.series.title) }
-                    @if let [(a, b, _)] = line.points[..] {
-                        circle cx=(n(x(a))) cy=(n(y(b))) r="3.5" {}
+                    @if let [only] = line.points[..] {
+                        circle cx=(n(x(only.x))) cy=(n(y(only.y))) r="3.5" {}
                     } @else {
-                        polyline class="line" points=(path(&mut line.points.iter().map(|p| (p.0, p.1)))) {}
+                        polyline class="line" points=(path(&mut line.points.iter().map(|p| (p.x, p.y)))) {}
                     }
                 }
             }
@@ -234,7 +252,7 @@ pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
 fn power(exponent: f64) -> String {
     match exponent.fract().abs() < 1e-9 {
         true => match exponent.round() as i64 {
-            k @ -2..=3 => format!("{}", 10f64.powi(k as i32)),
+            k @ -4..=3 => format!("{}", 10f64.powi(k as i32)),
             k => minus(format!("1e{k}")),
         },
         false => String::new(),

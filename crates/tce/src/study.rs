@@ -8,7 +8,6 @@ use std::sync::Arc;
 use clap::ValueEnum;
 use serde_json::Value;
 use tce_base::FileError;
-use tce_data::Agent;
 use tce_report::folder::Verdict;
 use tce_report::{Cost, Method, Missing, ReportError, Run, RunFolder, Study};
 
@@ -106,24 +105,25 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
         }
     }
     let networks = networks(&sweep.directory.join("runs"));
-    study.costs.splice(0..0, networks.values().map(|(cost, _)| cost.clone()));
-    let at = networks.len();
+    study.costs.splice(0..0, networks.values().cloned());
+    let mut at = networks.len();
     for entry in sweep.entries().iter().filter(|e| e.kind == Kind::Expand) {
-        if let Checked::Done(outcome) = sweep.check(entry) {
-            // The record is of the whole expansion; the networks have a record of their own.
-            let stage = sweep.directory.join(&outcome.place);
-            let training = networks_of(&stage).and_then(|name| networks.get(&name)).map_or(0.0, |(c, _)| c.seconds);
-            let rest = outcome.seconds - training;
-            let cost = Cost {
-                stage: "Labels, sampling, filter".into(),
-                agent: entry.task.agent,
-                // Networks that were there already took none of this time.
-                seconds: if rest > 0.0 { rest } else { outcome.seconds },
-                seeds: 1,
-                memory: outcome.memory,
-            };
-            study.costs.insert(at, cost);
-        }
+        // Only its time is of interest here: the rows themselves are verified by whoever reads them.
+        let Ok(Some(outcome)) = sweep.outcome(entry) else { continue };
+        // The record is of the whole expansion; the networks have a record of their own.
+        let stage = sweep.directory.join(&outcome.place);
+        let training = networks_of(&stage).and_then(|name| networks.get(&name)).map_or(0.0, |cost| cost.seconds);
+        let rest = outcome.seconds - training;
+        let cost = Cost {
+            stage: "Labels, sampling, filter".into(),
+            agent: entry.task.agent,
+            // Networks that were there already took none of this time.
+            seconds: if rest > 0.0 { rest } else { outcome.seconds },
+            seeds: 1,
+            memory: outcome.memory,
+        };
+        study.costs.insert(at, cost);
+        at += 1;
     }
     Ok(study)
 }
@@ -240,7 +240,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         });
     }
     let methods = in_order(methods);
-    let mut costs: Vec<Cost> = networks(directory).into_values().map(|(cost, _)| cost).collect();
+    let mut costs: Vec<Cost> = networks(directory).into_values().collect();
     let mut runs = Vec::new();
     for ((of, _, folder), id) in finished.into_iter().zip(ids) {
         costs.push(Cost {
@@ -305,7 +305,7 @@ fn json(path: &Path) -> Option<Value> {
 
 /// What the trainings of score networks under `root` cost, by the stage's name. A stage that cannot be read has no time: the runs
 /// are what counts.
-fn networks(root: &Path) -> BTreeMap<String, (Cost, Agent)> {
+fn networks(root: &Path) -> BTreeMap<String, Cost> {
     let stages = directories(&root.join("stages")).unwrap_or_default();
     let cost = |stage: &PathBuf| {
         let name = name_of(stage);
@@ -313,7 +313,7 @@ fn networks(root: &Path) -> BTreeMap<String, (Cost, Agent)> {
         let seconds = json(&stage.join("done.json"))?["summary"]["seconds"].as_f64().filter(|s| *s >= 0.0)?;
         let agent = parse_agent(spec["spec"]["inputs"]["agent"].as_str()?).ok()?;
         let seeds = spec["spec"]["seeds"].as_array().map_or(1, Vec::len);
-        Some((name, (Cost { stage: "Score networks".into(), agent, seconds, seeds, memory: None }, agent)))
+        Some((name, Cost { stage: "Score networks".into(), agent, seconds, seeds, memory: None }))
     };
     stages.iter().filter_map(cost).collect()
 }
