@@ -9,7 +9,7 @@ use tce_data::Shift;
 use crate::error::{ReportError, Result};
 use crate::folder::Verdict;
 use crate::paper::{self, PaperTable, Printed};
-use crate::stats::{Bootstrap, Draw, Estimate, Scores, probability_of_improvement};
+use crate::stats::{Bootstrap, Draw, Estimate, Scores, permutation_p, probability_of_improvement};
 use crate::study::{Method, Run, Study, Task};
 
 /// A diverged policy counts as much as a random one. Left out, it would flatter its method.
@@ -123,6 +123,8 @@ pub struct Aggregate {
     pub profile: Vec<Estimate>,
     /// Probability that a run of it scores higher than a run of each floor of the comparison; None for floors.
     pub over_floors: Option<Vec<Estimate>>,
+    /// How likely a difference as large as that to the best floor is by chance alone (permutation test); None for floors.
+    pub p_value: Option<f64>,
 }
 
 /// Methods on the tasks that all of them have.
@@ -138,6 +140,8 @@ pub struct Comparison {
     pub floors: Vec<usize>,
     /// The floor with the highest interquartile mean, by place in `floors`.
     pub best_floor: Option<usize>,
+    /// The intervals' coverage.
+    pub level: f64,
     /// Where the performance profiles are computed.
     #[serde(skip)]
     pub thresholds: Vec<f64>,
@@ -147,12 +151,14 @@ pub struct Comparison {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Finding {
-    /// The interval lies above one half.
+    /// The interval lies above one half, and chance alone seldom does that.
     Better,
-    /// The interval lies below one half.
+    /// The interval lies below one half, and chance alone seldom does that.
     Worse,
     /// The interval holds one half.
     Open,
+    /// The interval lies on one side of one half, but with so few runs chance alone often does that.
+    Few,
     /// There is no interval.
     Unknown,
 }
@@ -164,6 +170,7 @@ impl Finding {
             Finding::Better => "beats it",
             Finding::Worse => "falls short of it",
             Finding::Open => "no difference shown",
+            Finding::Few => "too few runs to tell",
             Finding::Unknown => "one seed: cannot be told",
         }
     }
@@ -212,11 +219,13 @@ impl Comparison {
     /// Probability that a run of `aggregate` scores higher than one of the best floor, and what that means.
     pub fn improvement(&self, aggregate: &Aggregate) -> Option<(Estimate, Finding)> {
         let estimate = aggregate.over_floors.as_ref()?[self.best_floor?];
+        let chance = aggregate.p_value.is_none_or(|p| p > 1.0 - self.level);
         let finding = match estimate.interval {
             None => Finding::Unknown,
+            Some((low, high)) if low <= 0.5 && high >= 0.5 => Finding::Open,
+            Some(_) if chance => Finding::Few,
             Some((low, _)) if low > 0.5 => Finding::Better,
-            Some((_, high)) if high < 0.5 => Finding::Worse,
-            Some(_) => Finding::Open,
+            Some(_) => Finding::Worse,
         };
         Some((estimate, finding))
     }
@@ -410,6 +419,10 @@ fn compare(
     let thresholds = thresholds(&tables);
     // Profiles have a value for every threshold: a fifth of the resamples keeps them as fast as the rest.
     let coarse = Bootstrap { resamples: (bootstrap.resamples / 5).max(1), ..*bootstrap };
+    let best_floor = (0..floors.len()).max_by(|a, b| {
+        let iqm = |k: &usize| table_of(floors[*k]).iqm();
+        iqm(a).total_cmp(&iqm(b))
+    });
     let mut methods = Vec::new();
     for (&m, scores) in kept.iter().zip(&tables) {
         let method = &study.methods[m];
@@ -429,6 +442,14 @@ fn compare(
             true => None,
             false => Some(floors.iter().map(improvements).collect::<Result<Vec<_>>>()?),
         };
+        let p_value = match best_floor {
+            Some(k) if !method.floor => {
+                let floor = floors[k];
+                let name = format!("{}/{}", method.id, study.methods[floor].id);
+                Some(permutation_p(bootstrap.streams, &name, bootstrap.resamples, scores, table_of(floor))?)
+            }
+            _ => None,
+        };
         methods.push(Aggregate {
             method: m,
             runs: scores.runs(),
@@ -437,14 +458,11 @@ fn compare(
             total: runs[4],
             profile,
             over_floors,
+            p_value,
         });
     }
-    let best_floor = (0..floors.len()).max_by(|a, b| {
-        let iqm = |k: &usize| table_of(floors[*k]).iqm();
-        iqm(a).total_cmp(&iqm(b))
-    });
     let tasks = places.iter().map(|&t| tasks[t]).collect();
-    Ok(Some(Comparison { tasks, methods, left_out, floors, best_floor, thresholds }))
+    Ok(Some(Comparison { tasks, methods, left_out, floors, best_floor, level: bootstrap.level, thresholds }))
 }
 
 /// Every second point from below the lowest score to above the highest, 0 and 100 included.
@@ -600,7 +618,8 @@ fn warnings(
                 c.methods.iter().filter(is).map(|a| title(a.method)).collect()
             };
             if let Some(floor) = c.best_floor() {
-                let (worse, open) = (finding(Finding::Worse), finding(Finding::Open));
+                let worse = finding(Finding::Worse);
+                let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
                 if !worse.is_empty() {
                     warn(format!("Below the best floor ({}): {}.", title(floor), list(worse)), Vec::new());
                 }

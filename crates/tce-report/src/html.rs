@@ -176,6 +176,15 @@ fn warnings(analysis: &Analysis) -> Markup {
     }
 }
 
+/// Two digits, or a bound.
+fn p_value(a: &Aggregate) -> String {
+    match a.p_value {
+        None => "–".into(),
+        Some(p) if p < 0.001 => "<0.001".into(),
+        Some(p) => format!("{p:.3}"),
+    }
+}
+
 fn findings(study: &Study, analysis: &Analysis) -> Markup {
     let Some(c) = &analysis.comparison else {
         return html! { p { "There is nothing to compare: no run has a score." } };
@@ -187,17 +196,20 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
     let sentence = |a: &Aggregate| -> Option<String> {
         let (p, finding) = c.improvement(a)?;
         let closing = match finding {
-            Finding::Better => "the interval lies above one half.",
-            Finding::Worse => "the interval lies below one half.",
+            Finding::Better => "it beats that floor.",
+            Finding::Worse => "it falls short of that floor.",
+            Finding::Few => "with so few runs chance alone often does that.",
             Finding::Open => "the interval holds one half, so that no difference is shown.",
             Finding::Unknown => "with one seed there is no interval.",
         };
         let [iqm, ..] = a.over_seeds;
         Some(format!(
-            "{}: interquartile mean {}. One of its runs outscores one of the best floor's with probability {}; {closing}",
+            "{}: interquartile mean {}. One of its runs outscores one of the best floor's with probability {} \
+             (permutation test: p = {}); {closing}",
             title(a.method),
             said(&iqm, 1),
             said(&p, 2),
+            p_value(a),
         ))
     };
     html! {
@@ -217,7 +229,7 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
                         th class="first" {}
                         th colspan="2" {}
                         @if let Some(f) = floor {
-                            th class="edge" colspan="2" { "Against the best floor, " (title(f.method)) }
+                            th class="edge" colspan="3" { "Against the best floor, " (title(f.method)) }
                         }
                         th class="edge" colspan="3" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
                         @if !others.is_empty() {
@@ -227,7 +239,7 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
                     tr {
                         th class="first" { "Method" }
                         th { "Runs" } th { "Interquartile mean" }
-                        @if floor.is_some() { th class="edge" { "Outscores it" } th class="text" { "Finding" } }
+                        @if floor.is_some() { th class="edge" { "Outscores it" } th { "p" } th class="text" { "Finding" } }
                         th class="edge" { "Mean" } th { "Median" } th { "Total" }
                         @for (n, k) in others.iter().enumerate() {
                             th class=[(n == 0).then_some("edge")] { (title(c.floors[*k])) }
@@ -244,12 +256,14 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
                                 (None, _) => {}
                                 (_, Some((e, finding))) => {
                                     td class="edge" { (estimate(&e, 2)) }
+                                    td { (p_value(a)) }
                                     td class=(format!("text {}", match finding {
                                         Finding::Better => "better", Finding::Worse => "worse", _ => "",
                                     })) { (finding.word()) }
                                 }
                                 (Some(f), None) => {
                                     td class="edge" { "–" }
+                                    td {}
                                     td class="text" { @if f.method == a.method { "the best floor" } @else { "floor" } }
                                 }
                             }
@@ -850,6 +864,13 @@ fn methods(analysis: &Analysis) -> Markup {
              interquartile mean, median, mean, optimality gap, performance profiles, probability of improvement (a tie counts one half), \
              and percentile intervals of a bootstrap with " (analysis.resamples) " resamples (a fifth of them for profiles), stratified \
              by task. Every task has the same weight. The paper gives means and deviations only, so that its rows have no interval."
+        }
+        p {
+            b { "Findings. " }
+            "A method beats the best floor, or falls short of it, if the interval of its probability of improvement lies on one side of one \
+             half, and a permutation test, which deals each task's runs out to both anew, reaches p ≤ " (format!("{:.2}", 1.0 - analysis.level))
+            ". The test is there because a bootstrap of few runs can shrink to a point: two runs above two others are nothing \
+             extraordinary, for all that the interval says."
         }
         p {
             b { "Missing and failed runs. " }

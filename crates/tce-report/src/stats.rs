@@ -240,6 +240,39 @@ impl Bootstrap {
     }
 }
 
+/// How often a random assignment of a task's runs to the two methods gives a probability of improvement as far from one half as
+/// the true one: a stratified permutation test, two-sided, exact up to the number of shuffles. With few runs it cannot become small,
+/// whereas a bootstrap's interval can shrink to a point.
+///
+/// # Errors
+/// If the two are not on equally many tasks.
+pub fn permutation_p(streams: Streams, name: &str, shuffles: usize, x: &Scores, y: &Scores) -> Result<f64, StatsError> {
+    if x.tasks.len() != y.tasks.len() {
+        return Err(StatsError::OtherTasks { found: y.tasks.len(), expected: x.tasks.len() });
+    }
+    let distance = |x: &Scores, y: &Scores| (probability_of_improvement(x, y) - 0.5).abs();
+    let observed = distance(x, y);
+    let one = |k: usize| {
+        let mut rng = streams.indexed(&format!("report/permutation/{name}"), k as u64);
+        let (mut a, mut b) = (x.clone(), y.clone());
+        for (a, b) in a.tasks.iter_mut().zip(&mut b.tasks) {
+            let mut all: Vec<f64> = a.iter().chain(b.iter()).copied().collect();
+            // The first places of a Fisher-Yates shuffle are a's.
+            for place in 0..a.len() {
+                let from = rng.random_range(place..all.len());
+                all.swap(place, from);
+            }
+            let (first, rest) = all.split_at(a.len());
+            a.copy_from_slice(first);
+            b.copy_from_slice(rest);
+        }
+        usize::from(distance(&a, &b) >= observed - 1e-12)
+    };
+    let as_far: usize = (0..shuffles).into_par_iter().map(one).sum();
+    // The true assignment is one of them.
+    Ok((as_far + 1) as f64 / (shuffles + 1) as f64)
+}
+
 fn mean_of(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let n = values.len() as f64;
     values.sum::<f64>() / n
@@ -354,6 +387,19 @@ mod tests {
         // [0, 0, 9, 30, 100, 1000]: one run of six goes on either side.
         let scores = Scores::new(vec![vec![30.0, 0.0, 9.0], vec![1000.0, 0.0, 100.0]]).unwrap();
         assert!((scores.iqm() - (0.0 + 9.0 + 30.0 + 100.0) / 4.0).abs() < 1e-12);
+    }
+
+    /// Two runs against two, all above: 2 of the 6 assignments are as far. Five against five: 2 of 252.
+    #[test]
+    fn permutations_are_counted() {
+        let p = |n: u32| {
+            let of = |from: u32| Scores::new(vec![(from..from + n).map(f64::from).collect()]).unwrap();
+            permutation_p(Streams::new(0), "test", 20_000, &of(100), &of(0)).unwrap()
+        };
+        assert!((p(2) - 2.0 / 6.0).abs() < 0.015, "{}", p(2));
+        assert!((p(5) - 2.0 / 252.0).abs() < 0.003, "{}", p(5));
+        let same = by_task(&X);
+        assert_eq!(permutation_p(Streams::new(0), "test", 100, &same, &same).unwrap(), 1.0);
     }
 
     #[test]

@@ -120,13 +120,18 @@ fn a_folder_of_runs_becomes_a_page() {
     for (name, score) in [("bc-raw", 17.0), ("bc", 90.0), ("bc-top", 91.0), ("target-only", 80.0), ("tce-og", 70.0)] {
         write_run(
             &place.join(format!("{name}-0123456789ab")),
-            &[0, 1, 2],
-            &[score, score + 1.0, score + 2.0],
+            &[0, 1, 2, 3, 4],
+            &[score, score + 1.0, score + 2.0, score + 3.0, score + 4.0],
             "a = 1\n",
         );
     }
     // Other settings of the same method, task and seeds; and a run that was killed.
-    write_run(&place.join("tce-og-aaaaaaaaaaaa"), &[0, 1, 2], &[95.0, 96.0, 97.0], "a = 2\nmode = \"published\"\n");
+    write_run(
+        &place.join("tce-og-aaaaaaaaaaaa"),
+        &[0, 1, 2, 3, 4],
+        &[95.0, 96.0, 97.0, 98.0, 99.0],
+        "a = 2\nmode = \"published\"\n",
+    );
     fs::create_dir_all(place.join("tce-nn-bbbbbbbbbbbb")).unwrap();
     fs::write(place.join("tce-nn-bbbbbbbbbbbb/spec.json"), "{}").unwrap();
     let report = tce_json(dir.path(), &["report", "runs", "--resamples", "200", "--out", "elsewhere"]);
@@ -136,7 +141,7 @@ fn a_folder_of_runs_becomes_a_page() {
     assert_eq!(methods.iter().filter(|m| m.starts_with("tce-og ")).count(), 2, "{methods:?}");
     let warnings = report["warnings"].to_string();
     for text in [
-        "Partial results: 1 of 19",
+        "Partial results: 1 of 31",
         "several runs of one seed",
         "Published mode",
         "Below the best floor (BC, best half)",
@@ -144,5 +149,5 @@ fn a_folder_of_runs_becomes_a_page() {
         assert!(warnings.contains(text), "{text}: {warnings}");
     }
     let page = fs::read_to_string(dir.path().join("elsewhere/report.html")).unwrap();
-    assert!(page.contains("1 of 2 methods beats the best floor") && page.contains("96.0") && page.contains("99.8"));
+    assert!(page.contains("1 of 2 methods beats the best floor") && page.contains("97.0") && page.contains("99.8"));
 }
