@@ -31,6 +31,9 @@ pub enum Error {
     /// The generator failed.
     #[error(transparent)]
     Diffusion(#[from] tce_diffusion::DiffusionError),
+    /// A report could not be made.
+    #[error(transparent)]
+    Report(#[from] tce_report::ReportError),
     /// A result does not meet what was asked of it (`tce data check --replay`).
     #[error("{0}")]
     Failed(String),

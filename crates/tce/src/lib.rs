@@ -23,6 +23,7 @@ mod pipeline;
 mod scratch;
 mod stage;
 mod stand_ins;
+mod study;
 mod sweep;
 mod task;
 mod units;

@@ -15,6 +15,7 @@ mod data;
 mod diagnose;
 mod evaluate;
 mod learn;
+mod report;
 mod run;
 mod sweep;
 mod train_sac;
@@ -67,6 +68,8 @@ enum Command {
     /// Many runs: planned once, done on one machine or on Slurm, gathered into a table.
     #[command(subcommand)]
     Sweep(sweep::SweepCommand),
+    /// Statistics, tables beside the paper's, and a page that shows them, of a sweep or of a folder of runs.
+    Report(report::Report),
     /// Measure how fast the program's hot loops run on this machine.
     Bench(bench::Bench),
 }
@@ -98,6 +101,7 @@ impl Cli {
             Command::Config(command) => command.run(output),
             Command::Diagnose(command) => command.run(output),
             Command::Sweep(command) => command.run(output, self.save_every),
+            Command::Report(args) => args.run(output),
             Command::Bench(args) => args.run(output),
         }
     }

@@ -31,6 +31,17 @@ pub struct Row {
     pub program: String,
 }
 
+/// What is known of a piece of work.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Checked {
+    /// It is not done.
+    Missing,
+    /// Its files are not what they were, or the record of it is damaged.
+    Corrupt(String),
+    /// It is done and whole.
+    Done(Outcome),
+}
+
 /// All that is done, and what is wrong.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Gathered {
@@ -52,27 +63,42 @@ impl Sweep {
     pub fn gather(&self) -> Result<Gathered> {
         let mut out = Gathered::default();
         for entry in self.entries().iter().filter(|e| e.kind == Kind::Run) {
-            match self.outcome(entry) {
-                Ok(None) => out.missing.push(entry.to_string()),
-                Ok(Some(outcome)) => match self.damage(entry, &outcome) {
-                    Some(what) => out.corrupt.push(format!("{entry}: {what}")),
-                    None => out.rows.push(Row {
-                        task: entry.task.to_string(),
-                        method: entry.column(),
-                        seed: entry.seed,
-                        score: outcome.score,
-                        place: outcome.place,
-                        seconds: outcome.seconds,
-                        program: outcome.program,
-                    }),
-                },
-                Err(e) => out.corrupt.push(format!("{entry}: {e}")),
+            match self.check(entry) {
+                Checked::Missing => out.missing.push(entry.to_string()),
+                Checked::Corrupt(what) => out.corrupt.push(format!("{entry}: {what}")),
+                Checked::Done(outcome) => out.rows.push(Row {
+                    task: entry.task.to_string(),
+                    method: entry.column(),
+                    seed: entry.seed,
+                    score: outcome.score,
+                    place: outcome.place,
+                    seconds: outcome.seconds,
+                    program: outcome.program,
+                }),
             }
         }
-        let faults = fs::read_dir(self.directory.join("faults")).into_iter().flatten().flatten();
-        out.conflicts = faults.map(|f| f.path()).collect();
-        out.conflicts.sort();
+        out.conflicts = self.conflicts();
         Ok(out)
+    }
+
+    /// The outcome of a piece of work, verified file by file.
+    pub fn check(&self, entry: &Entry) -> Checked {
+        match self.outcome(entry) {
+            Ok(None) => Checked::Missing,
+            Ok(Some(outcome)) => match self.damage(entry, &outcome) {
+                Some(what) => Checked::Corrupt(what),
+                None => Checked::Done(outcome),
+            },
+            Err(e) => Checked::Corrupt(e.to_string()),
+        }
+    }
+
+    /// Results that came later than another of the same work and differ.
+    pub fn conflicts(&self) -> Vec<PathBuf> {
+        let faults = fs::read_dir(self.directory.join("faults")).into_iter().flatten().flatten();
+        let mut conflicts: Vec<PathBuf> = faults.map(|f| f.path()).collect();
+        conflicts.sort();
+        conflicts
     }
 
     fn damage(&self, entry: &Entry, outcome: &Outcome) -> Option<String> {

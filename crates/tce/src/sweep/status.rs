@@ -117,7 +117,8 @@ impl Sweep {
         out
     }
 
-    pub(super) fn failure(&self, entry: &Entry) -> Option<Failure> {
+    /// Why a piece of work failed the last time, if it did.
+    pub fn failure(&self, entry: &Entry) -> Option<Failure> {
         let bytes = fs::read(self.file("failed", &format!("{}.json", entry.id))).ok()?;
         serde_json::from_slice(&bytes).ok()
     }

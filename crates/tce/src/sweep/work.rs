@@ -37,6 +37,9 @@ pub struct Outcome {
     pub files: BTreeMap<String, String>,
     /// Seconds it took.
     pub seconds: f64,
+    /// Most memory of the process meanwhile, in bytes, where the system tells it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory: Option<u64>,
     /// The program that did it.
     pub program: String,
 }
@@ -72,6 +75,19 @@ pub struct Active {
 /// Seconds since 1970.
 pub fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
+}
+
+/// Lets the peak of this process's memory begin anew, so that pieces of work that share a process have their own. Where the
+/// system cannot do that, a later piece has the peak of all before it.
+fn forget_peak_memory() {
+    let _ = fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Most memory that this process had at a time, in bytes.
+fn peak_memory() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let kilobytes = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.split_whitespace().next()?;
+    Some(kilobytes.parse::<u64>().ok()? * 1024)
 }
 
 /// A file in `active/` that is touched as long as this lives.
@@ -170,6 +186,7 @@ impl Sweep {
 
     fn compute(&self, entry: &Entry) -> Result<Outcome> {
         let started = Instant::now();
+        forget_peak_memory();
         let config = self.manifest.config(entry)?;
         let args = self.data(entry);
         let root = &args.out;
@@ -205,6 +222,7 @@ impl Sweep {
             place: place.strip_prefix(&self.directory).unwrap_or(&place).to_owned(),
             files,
             seconds: started.elapsed().as_secs_f64(),
+            memory: peak_memory(),
             program: PROGRAM.into(),
         })
     }
@@ -257,6 +275,7 @@ mod tests {
             place: "runs/x".into(),
             files: BTreeMap::new(),
             seconds,
+            memory: None,
             program: "tce".into(),
         };
         assert_eq!(sweep.outcome(entry).unwrap(), None);

@@ -36,7 +36,7 @@ pub fn describe(directory: &Path, name: &str, seeds: u64) -> String {
     file
 }
 
-/// What the records in `done/` say, without times.
+/// What the records in `done/` say, without times and memory.
 pub fn outcomes(sweep: &Path) -> BTreeMap<String, Value> {
     let mut out = BTreeMap::new();
     for path in fs::read_dir(sweep.join("done")).into_iter().flatten().map(|e| e.unwrap().path()) {
@@ -45,7 +45,9 @@ pub fn outcomes(sweep: &Path) -> BTreeMap<String, Value> {
             continue;
         }
         let mut value: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
-        value.as_object_mut().unwrap().remove("seconds");
+        for cost in ["seconds", "memory"] {
+            value.as_object_mut().unwrap().remove(cost);
+        }
         out.insert(name, value);
     }
     out

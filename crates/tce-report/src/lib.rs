@@ -1,0 +1,43 @@
+//! What many runs come to, and a page that says so: statistics over tasks and seeds, the tables of the paper beside ours, and
+//! the report as HTML, Markdown and LaTeX.
+//!
+//! [`study::Study`] holds what there is, [`analysis::analyse`] decides every figure and warning, and [`html`] and [`text`] only
+//! print them.
+
+pub mod analysis;
+pub mod error;
+pub mod folder;
+pub mod html;
+pub mod paper;
+pub mod stats;
+pub mod study;
+pub mod svg;
+pub mod text;
+
+pub use analysis::{Analysis, Options, analyse};
+pub use error::{ReportError, Result};
+pub use folder::RunFolder;
+pub use study::{Cost, Method, Missing, Run, Study, Task};
+
+use std::path::{Path, PathBuf};
+
+use tce_base::write_atomically;
+
+/// Writes `report.html`, `report.md` and `report.tex` into `directory`.
+///
+/// # Errors
+/// If a file cannot be written.
+pub fn write(study: &Study, analysis: &Analysis, directory: &Path) -> Result<Vec<PathBuf>> {
+    let files = [
+        ("report.html", html::page(study, analysis)),
+        ("report.md", text::markdown(study, analysis)),
+        ("report.tex", text::latex(study, analysis)),
+    ];
+    let mut written = Vec::new();
+    for (name, text) in files {
+        let path = directory.join(name);
+        write_atomically(&path, text.as_bytes())?;
+        written.push(path);
+    }
+    Ok(written)
+}

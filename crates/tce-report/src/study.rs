@@ -1,0 +1,150 @@
+//! What a report is about: methods, their runs, and what is missing.
+
+use std::fmt;
+use std::sync::Arc;
+
+use serde::Serialize;
+use tce_data::{Agent, Quality, Shift};
+
+use crate::folder::{Member, RunFolder};
+
+/// A transfer problem.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Task {
+    /// The robot.
+    pub agent: Agent,
+    /// What the target domain changes.
+    pub shift: Shift,
+    /// Quality of the source data.
+    pub source: Quality,
+    /// Quality of the target data.
+    pub target: Quality,
+}
+
+impl Task {
+    /// The paper's order: shifts, agents, source and target qualities.
+    pub fn order(&self) -> (usize, usize, Quality, Quality) {
+        let place = |k: Option<usize>| k.unwrap_or(usize::MAX);
+        let shift = place(Shift::ALL.iter().position(|s| *s == self.shift));
+        (shift, place(Agent::ALL.iter().position(|a| *a == self.agent)), self.source, self.target)
+    }
+
+    /// As in a table of one shift: `Hopper, medium → expert`.
+    pub fn short(&self) -> String {
+        format!("{}, {} → {}", agent_title(self.agent), self.source, self.target)
+    }
+}
+
+impl fmt::Display for Task {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(&format!("{}-{}:{}->{}", self.agent, self.shift, self.source, self.target))
+    }
+}
+
+impl Serialize for Task {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// The agent's name in print.
+pub fn agent_title(agent: Agent) -> &'static str {
+    match agent {
+        Agent::HalfCheetah => "HalfCheetah",
+        Agent::Hopper => "Hopper",
+        Agent::Walker2d => "Walker2d",
+        Agent::Ant => "Ant",
+    }
+}
+
+/// The shift's name in headings.
+pub fn shift_title(shift: Shift) -> &'static str {
+    match shift {
+        Shift::Source => "No shift",
+        Shift::Morph => "Morphology shift",
+        Shift::Kinematic => "Kinematic shift",
+        Shift::Gravity => "Gravity shift",
+        Shift::Gravity5 => "Gravity shift, fivefold",
+    }
+}
+
+/// A column of the tables.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Method {
+    /// Unique among the methods: `tce-og`, or with the name of a sweep's override `tce-og y0.1`.
+    pub id: String,
+    /// In print.
+    pub title: String,
+    /// The variant, without an override's name.
+    pub variant: String,
+    /// Whether it is one of the floors that every result has to beat.
+    pub floor: bool,
+    /// Whether nothing but the variant decides its settings, so that the paper's column of this name is its counterpart.
+    pub plain: bool,
+}
+
+/// One policy and its score.
+#[derive(Clone, Debug)]
+pub struct Run {
+    /// The task.
+    pub task: Task,
+    /// The method's id.
+    pub method: String,
+    /// The seed and its score.
+    pub member: Member,
+    /// The member's place in its folder.
+    pub index: usize,
+    /// Its folder, which it may share with other seeds.
+    pub folder: Arc<RunFolder>,
+}
+
+/// A planned or begun run without a result.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Missing {
+    /// The task.
+    pub task: Task,
+    /// The method's id.
+    pub method: String,
+    /// What it is, in words.
+    pub what: String,
+    /// Why there is no result.
+    pub why: String,
+}
+
+/// What a piece of work cost.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Cost {
+    /// The kind of work, in print.
+    pub stage: String,
+    /// The robot.
+    pub agent: Agent,
+    /// Seconds on the clock.
+    pub seconds: f64,
+    /// Seeds that were done side by side in this time.
+    pub seeds: usize,
+    /// Most memory of the process, in bytes, where it was noted.
+    pub memory: Option<u64>,
+}
+
+/// Everything a report is made from.
+#[derive(Clone, Debug)]
+pub struct Study {
+    /// Its name.
+    pub name: String,
+    /// Whether it is a planned sweep; otherwise it is a folder with runs of `tce run`.
+    pub sweep: bool,
+    /// Where it is.
+    pub directory: String,
+    /// Columns, floors first.
+    pub methods: Vec<Method>,
+    /// Results.
+    pub runs: Vec<Run>,
+    /// Runs without a result.
+    pub missing: Vec<Missing>,
+    /// Results that came later than another of the same work, and differ.
+    pub conflicts: Vec<String>,
+    /// Anything else a reader has to know.
+    pub notes: Vec<String>,
+    /// What the stages cost.
+    pub costs: Vec<Cost>,
+}

@@ -1,0 +1,214 @@
+//! The report's tables as Markdown and as LaTeX.
+
+use crate::analysis::{Analysis, Cell, ShiftTable};
+use crate::html::headline;
+use crate::stats::Estimate;
+use crate::study::{Study, shift_title};
+
+/// A table: a header, and rows of as many cells. The first column is text.
+struct Table {
+    title: String,
+    header: Vec<String>,
+    rows: Vec<Vec<String>>,
+    /// Rows that follow a rule.
+    rules: Vec<usize>,
+}
+
+fn estimate(e: &Estimate, decimals: usize) -> String {
+    match e.interval {
+        Some((low, high)) => format!("{:.decimals$} [{low:.decimals$}, {high:.decimals$}]", e.point),
+        None => format!("{:.decimals$}", e.point),
+    }
+}
+
+fn title(analysis: &Analysis, m: usize) -> String {
+    let mark = if analysis.published[m] { " (published mode)" } else { "" };
+    format!("{}{mark}", analysis.methods[m].title)
+}
+
+fn cell(cell: Option<&Cell>) -> String {
+    let Some(c) = cell else { return "–".into() };
+    let std = c.std.map_or_else(String::new, |s| format!(" ± {s:.1}"));
+    format!("{:.1}{std}{}", c.mean, if c.diverged > 0 { "†" } else { "" })
+}
+
+fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Table {
+    let columns = t.paper.map_or(&[][..], |p| &p.columns[..]);
+    let ours = (0..analysis.methods.len()).map(|m| title(analysis, m));
+    let papers = columns.iter().map(|c| format!("{} (paper, Table {})", c.method, c.table));
+    let mut rows: Vec<Vec<String>> = t
+        .rows
+        .iter()
+        .map(|r| {
+            let ours = r.cells.iter().map(|c| cell(c.as_ref()));
+            let papers = r.paper.iter().map(|p| p.map_or("–".into(), |p| format!("{:.1} ± {:.1}", p.mean, p.std)));
+            std::iter::once(r.task.short()).chain(ours).chain(papers).collect()
+        })
+        .collect();
+    let of = |n: usize| if n < t.rows.len() { format!(" (of {n} tasks)") } else { String::new() };
+    let ours_total = t.totals.iter().map(|x| match x {
+        None => "–".into(),
+        Some(x) => format!("{}{}", estimate(&x.estimate, 1), of(x.tasks)),
+    });
+    let paper_total = t.paper_totals.iter().map(|(sum, n)| match n {
+        0 => "–".to_owned(),
+        n => format!("{sum:.1}{}", of(*n)),
+    });
+    rows.push(std::iter::once("Total".into()).chain(ours_total).chain(paper_total).collect());
+    Table {
+        title: shift_title(t.shift).into(),
+        header: std::iter::once("Task".into()).chain(ours).chain(papers).collect(),
+        rules: vec![rows.len() - 1],
+        rows,
+    }
+}
+
+fn statistics(analysis: &Analysis) -> Option<Table> {
+    let c = analysis.comparison.as_ref()?;
+    let mut header: Vec<String> =
+        ["Method", "Runs", "Interquartile mean", "Mean", "Median", "Optimality gap", "Total"].map(Into::into).to_vec();
+    header.extend(c.floors.iter().map(|f| format!("P(> {})", analysis.methods[*f].title)));
+    header.push("Against the best floor".into());
+    let rows = c.methods.iter().map(|a| {
+        let [iqm, median, mean, gap] = a.over_seeds;
+        let mut row = vec![title(analysis, a.method), a.runs.to_string()];
+        row.extend([iqm, mean, median, gap, a.total].iter().map(|e| estimate(e, 1)));
+        match &a.over_floors {
+            Some(over) => row.extend(over.iter().map(|e| estimate(e, 2))),
+            None => row.extend(c.floors.iter().map(|_| "–".into())),
+        }
+        row.push(match (analysis.methods[a.method].floor, c.improvement(a)) {
+            (true, _) if c.best_floor() == Some(a.method) => "the best floor".into(),
+            (true, _) => "floor".into(),
+            (false, Some((_, finding))) => finding.word().into(),
+            (false, None) => "–".into(),
+        });
+        row
+    });
+    let n = c.tasks.len();
+    Some(Table {
+        title: format!("Statistics over {n} task{}", if n == 1 { "" } else { "s" }),
+        header,
+        rows: rows.collect(),
+        rules: Vec::new(),
+    })
+}
+
+fn tables(analysis: &Analysis) -> Vec<Table> {
+    statistics(analysis).into_iter().chain(analysis.tables.iter().map(|t| shift_table(analysis, t))).collect()
+}
+
+fn caption(study: &Study, analysis: &Analysis) -> String {
+    format!(
+        "{} of {} runs have a result. Normalised scores, mean ± standard deviation over seeds; brackets: {:.0} % intervals of a bootstrap \
+         stratified by task; † with a diverged policy, counted as 0.",
+        study.runs.len(),
+        study.runs.len() + study.missing.len(),
+        100.0 * analysis.level
+    )
+}
+
+/// The report's tables, warnings and finding in Markdown.
+pub fn markdown(study: &Study, analysis: &Analysis) -> String {
+    let mut out = format!("# {}\n\n{}\n\n", md(&study.name), md(&headline(analysis)));
+    for w in &analysis.warnings {
+        out += &format!("> **Note.** {}\n", md(&w.text));
+        for d in &w.details {
+            out += &format!("> - {}\n", md(d));
+        }
+        out += ">\n";
+    }
+    out += &format!("\n{}\n", md(&caption(study, analysis)));
+    for t in tables(analysis) {
+        let line = |cells: &[String]| format!("| {} |\n", cells.iter().map(|c| md(c)).collect::<Vec<_>>().join(" | "));
+        let rule: String = (0..t.header.len()).map(|k| if k == 0 { "|---" } else { "|---:" }).collect();
+        out += &format!("\n## {}\n\n{}{rule}|\n", t.title, line(&t.header));
+        out.extend(t.rows.iter().map(|r| line(r)));
+    }
+    out
+}
+
+/// Text that Markdown and the HTML in it leave alone.
+fn md(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out += "&amp;",
+            '<' => out += "&lt;",
+            '>' => out += "&gt;",
+            '\n' | '\r' => out.push(' '),
+            '\\' | '`' | '*' | '_' | '|' | '[' | ']' | '#' | '~' | '!' => {
+                out.push('\\');
+                out.push(c);
+            }
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// The report's tables in LaTeX, for `\input`; needs the packages booktabs, graphicx and textcomp.
+pub fn latex(study: &Study, analysis: &Analysis) -> String {
+    let mut out = String::from("% Made by `tce report`. \\usepackage{booktabs,graphicx,textcomp}\n");
+    for w in &analysis.warnings {
+        out += &format!("% Note: {}\n", w.text.replace(['\n', '\r'], " "));
+    }
+    for t in tables(analysis) {
+        let line =
+            |cells: &[String]| format!("  {} \\\\\n", cells.iter().map(|c| tex(c)).collect::<Vec<_>>().join(" & "));
+        out += &format!(
+            "\n\\begin{{table}}[t]\n\\centering\n\\caption{{{}: {}. {}}}\n\\resizebox{{\\linewidth}}{{!}}{{%\n\\begin{{tabular}}{{l{}}}\n\\toprule\n",
+            tex(&study.name),
+            tex(&t.title),
+            tex(&caption(study, analysis)),
+            "r".repeat(t.header.len() - 1),
+        );
+        out += &line(&t.header);
+        out += "\\midrule\n";
+        for (k, row) in t.rows.iter().enumerate() {
+            if t.rules.contains(&k) {
+                out += "\\midrule\n";
+            }
+            out += &line(row);
+        }
+        out += "\\bottomrule\n\\end{tabular}}\n\\end{table}\n";
+    }
+    out
+}
+
+/// Text that LaTeX prints as it is.
+fn tex(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '\\' => out += "\\textbackslash{}",
+            '~' => out += "\\textasciitilde{}",
+            '^' => out += "\\textasciicircum{}",
+            '<' => out += "\\textless{}",
+            '>' => out += "\\textgreater{}",
+            '&' | '%' | '$' | '#' | '_' | '{' | '}' => {
+                out.push('\\');
+                out.push(c);
+            }
+            '±' => out += "$\\pm$",
+            '→' => out += "$\\to$",
+            '†' => out += "\\textdagger{}",
+            '−' => out += "$-$",
+            '–' => out += "--",
+            '\n' | '\r' => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn special_characters_print_as_themselves() {
+        assert_eq!(md("a|b <i>*x*\n"), "a\\|b &lt;i&gt;\\*x\\* ");
+        assert_eq!(tex("5% of a_b & \\x"), "5\\% of a\\_b \\& \\textbackslash{}x");
+    }
+}

@@ -1,0 +1,346 @@
+//! What a report is made from: a sweep's folder, or a folder with runs of `tce run`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::ValueEnum;
+use serde_json::Value;
+use tce_base::FileError;
+use tce_report::folder::Verdict;
+use tce_report::{Cost, Method, Missing, ReportError, Run, RunFolder, Study};
+
+use crate::error::{Error, Result};
+use crate::sweep::gather::Checked;
+use crate::sweep::{Entry, Kind, Sweep};
+use crate::task::{Task, parse_agent};
+use crate::variant::Variant;
+
+/// Everything that `directory` holds for a report.
+///
+/// # Errors
+/// If there is neither a sweep nor a run, or a file of one is damaged.
+pub fn of_directory(directory: &Path) -> Result<Study> {
+    if directory.join("manifest.jsonl").exists() { of_sweep(&Sweep::open(directory)?) } else { of_runs(directory) }
+}
+
+fn task(task: Task) -> tce_report::Task {
+    let Task { agent, shift, source, target } = task;
+    tce_report::Task { agent, shift, source, target }
+}
+
+fn method(variant: Variant, label: &str) -> Method {
+    let floor = Variant::FLOORS.contains(&variant);
+    let (id, title) = match label {
+        "" => (variant.name(), variant.title().to_owned()),
+        label => (format!("{variant} {label}"), format!("{}, {label}", variant.title())),
+    };
+    Method { id, title, variant: variant.name(), floor, plain: label.is_empty() }
+}
+
+/// Floors first, and all four of them: a table without a floor shows that it lacks it.
+fn in_order(mut methods: Vec<Method>) -> Vec<Method> {
+    for floor in Variant::FLOORS {
+        if !methods.iter().any(|m| m.variant == floor.name()) {
+            methods.push(method(floor, ""));
+        }
+    }
+    let place = |m: &Method| Variant::FLOORS.iter().position(|f| f.name() == m.variant).unwrap_or(usize::MAX);
+    methods.sort_by_key(place);
+    methods
+}
+
+fn of_sweep(sweep: &Sweep) -> Result<Study> {
+    let runs = || sweep.entries().iter().filter(|e| e.kind == Kind::Run);
+    let mut methods: Vec<Method> = Vec::new();
+    for (variant, entry) in runs().filter_map(|e| Some((e.variant?, e))) {
+        if !methods.iter().any(|m| m.id == entry.column()) {
+            methods.push(method(variant, &entry.label));
+        }
+    }
+    let mut study = Study {
+        name: sweep.manifest.header.name.clone(),
+        sweep: true,
+        directory: sweep.directory.display().to_string(),
+        methods: in_order(methods),
+        runs: Vec::new(),
+        missing: Vec::new(),
+        conflicts: sweep.conflicts().iter().map(|p| p.display().to_string()).collect(),
+        notes: Vec::new(),
+        costs: Vec::new(),
+    };
+    for entry in runs() {
+        let mut missing = |why: String| {
+            study.missing.push(Missing {
+                task: task(entry.task),
+                method: entry.column(),
+                what: entry.to_string(),
+                why,
+            });
+        };
+        match sweep.check(entry) {
+            Checked::Missing => missing(match sweep.failure(entry) {
+                Some(failure) => format!("failed: {}", failure.error),
+                None => "not done".into(),
+            }),
+            Checked::Corrupt(what) => missing(format!("corrupt: {what}")),
+            Checked::Done(outcome) => {
+                let directory = sweep.directory.join(&outcome.place);
+                match RunFolder::read(&directory)? {
+                    None => missing(format!("corrupt: {} has no done.json", directory.display())),
+                    Some(folder) => {
+                        agree(sweep, entry, outcome.score, &folder)?;
+                        study.costs.push(Cost {
+                            stage: learning(&method_title(&study.methods, &entry.column())),
+                            agent: entry.task.agent,
+                            seconds: folder.learning_seconds,
+                            seeds: folder.members.len(),
+                            memory: outcome.memory,
+                        });
+                        add_runs(&mut study.runs, entry.task, &entry.column(), folder);
+                    }
+                }
+            }
+        }
+    }
+    let networks = networks(&sweep.directory.join("runs"));
+    study.costs.splice(0..0, networks.values().cloned());
+    let mut at = networks.len();
+    for entry in sweep.entries().iter().filter(|e| e.kind == Kind::Expand) {
+        // Only its time is of interest here: the rows themselves are verified by whoever reads them.
+        let Ok(Some(outcome)) = sweep.outcome(entry) else { continue };
+        // The record is of the whole expansion; the networks have a record of their own.
+        let stage = sweep.directory.join(&outcome.place);
+        let training = networks_of(&stage).and_then(|name| networks.get(&name)).map_or(0.0, |cost| cost.seconds);
+        let rest = outcome.seconds - training;
+        let cost = Cost {
+            stage: "Labels, sampling, filter".into(),
+            agent: entry.task.agent,
+            // Networks that were there already took none of this time.
+            seconds: if rest > 0.0 { rest } else { outcome.seconds },
+            seeds: 1,
+            memory: outcome.memory,
+        };
+        study.costs.insert(at, cost);
+        at += 1;
+    }
+    Ok(study)
+}
+
+fn learning(title: &str) -> String {
+    format!("Learning and evaluation, {title}")
+}
+
+fn method_title(methods: &[Method], id: &str) -> String {
+    methods.iter().find(|m| m.id == id).map_or_else(|| id.to_owned(), |m| m.title.clone())
+}
+
+/// Refuses a sweep's record that says something else than the run itself.
+fn agree(sweep: &Sweep, entry: &Entry, recorded: Option<f64>, folder: &RunFolder) -> Result<()> {
+    let found = match folder.members.iter().find(|m| m.seed == entry.seed).map(|m| &m.verdict) {
+        Some(Verdict::Score(score)) => Some(*score),
+        Some(_) => None,
+        None => {
+            let seeds: Vec<u64> = folder.members.iter().map(|m| m.seed).collect();
+            return Err(ReportError::field(
+                &folder.directory.join("done.json"),
+                "summary.seeds",
+                format!("{seeds:?}"),
+                format!("{} among them, as the manifest has it", entry.seed),
+                "remove the run's folder and its record in done/, and launch the sweep again",
+            )
+            .into());
+        }
+    };
+    if recorded.map(f64::to_bits) == found.map(f64::to_bits) {
+        return Ok(());
+    }
+    let text = |score: Option<f64>| score.map_or("null".to_owned(), |s| s.to_string());
+    Err(ReportError::field(
+        &sweep.directory.join("done").join(format!("{}.json", entry.id)),
+        "score",
+        text(recorded),
+        format!("{}, as {} has it", text(found), folder.directory.join("done.json").display()),
+        "remove the record and launch the sweep again",
+    )
+    .into())
+}
+
+fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder) {
+    let folder = Arc::new(folder);
+    for (index, member) in folder.members.iter().enumerate() {
+        runs.push(Run {
+            task: task(of),
+            method: method.to_owned(),
+            member: member.clone(),
+            index,
+            folder: folder.clone(),
+        });
+    }
+}
+
+/// The directories in `directory`, ascending.
+fn directories(directory: &Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(directory).map_err(|e| FileError::new(directory, "read the directory", e))?;
+    let mut found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
+    found.sort();
+    Ok(found)
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned())
+}
+
+/// The task whose [`Task::directory`] this is.
+fn task_of(directory: &Path) -> Option<Task> {
+    name_of(directory).replacen('_', ":", 1).replace("-to-", "->").parse().ok()
+}
+
+fn of_runs(directory: &Path) -> Result<Study> {
+    let mut finished: Vec<(Task, String, RunFolder)> = Vec::new();
+    let mut missing: Vec<Missing> = Vec::new();
+    for (of, place) in directories(directory)?.iter().filter_map(|p| Some((task_of(p)?, p))) {
+        for run in directories(place)? {
+            // METHOD-KEY, as stages are named.
+            let full = name_of(&run);
+            let Some((name, _)) = full.rsplit_once('-').filter(|_| run.join("spec.json").exists()) else { continue };
+            let mut lost = |why: String| {
+                let what = format!("{name}, {of}, {}", run.display());
+                missing.push(Missing { task: task(of), method: name.to_owned(), what, why });
+            };
+            match RunFolder::read(&run)? {
+                None => lost("not finished: no done.json".into()),
+                Some(folder) => match folder.damage() {
+                    Some(what) => lost(format!("corrupt: {what}")),
+                    None => finished.push((of, name.to_owned(), folder)),
+                },
+            }
+        }
+    }
+    if finished.is_empty() && missing.is_empty() {
+        return Err(Error::missing(
+            directory,
+            "found neither a sweep (manifest.jsonl) nor runs (TASK/METHOD-KEY/spec.json); give the folder of `tce sweep plan --out` or \
+             that of `tce run --out`, which is runs/ unless told otherwise",
+        ));
+    }
+    let mut notes = Vec::new();
+    let ids = columns(&finished, &mut notes);
+    let mut methods: Vec<Method> = Vec::new();
+    for (name, id) in finished.iter().map(|f| &f.1).zip(&ids).chain(missing.iter().map(|m| (&m.method, &m.method))) {
+        if methods.iter().any(|m| m.id == *id) {
+            continue;
+        }
+        let label = id.strip_prefix(name.as_str()).unwrap_or_default().trim();
+        methods.push(match Variant::from_str(name, false) {
+            Ok(variant) => Method { id: id.clone(), ..method(variant, label) },
+            // A name of the user's own.
+            Err(_) => Method { id: id.clone(), title: id.clone(), variant: name.clone(), floor: false, plain: false },
+        });
+    }
+    let methods = in_order(methods);
+    let mut costs: Vec<Cost> = networks(directory).into_values().collect();
+    let mut runs = Vec::new();
+    for ((of, _, folder), id) in finished.into_iter().zip(ids) {
+        costs.push(Cost {
+            stage: learning(&method_title(&methods, &id)),
+            agent: of.agent,
+            seconds: folder.learning_seconds,
+            seeds: folder.members.len(),
+            memory: None,
+        });
+        add_runs(&mut runs, of, &id, folder);
+    }
+    let name = directory.canonicalize().map_or_else(|_| name_of(directory), |d| name_of(&d));
+    Ok(Study {
+        name,
+        sweep: false,
+        directory: directory.display().to_string(),
+        methods,
+        runs,
+        missing,
+        conflicts: Vec::new(),
+        notes,
+        costs,
+    })
+}
+
+/// The column of every finished run: its name. Where a task has two runs of one name and seed, they differ in their settings or
+/// their data, and every setting, or else every folder, of that name is a column of its own.
+fn columns(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
+    let mut ids: Vec<String> = finished.iter().map(|(_, name, _)| name.clone()).collect();
+    let marks: [fn(&RunFolder) -> String; 2] = [
+        |f| f.config_hash[..6].to_owned(),
+        |f| name_of(&f.directory).rsplit('-').next().unwrap_or_default().to_owned(),
+    ];
+    for mark in marks {
+        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
+        let mut twice: BTreeSet<String> = BTreeSet::new();
+        for ((of, name, folder), id) in finished.iter().zip(&ids) {
+            for member in &folder.members {
+                if !seen.insert((*of, id, member.seed)) {
+                    twice.insert(name.clone());
+                }
+            }
+        }
+        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|((_, name, _), _)| twice.contains(name)) {
+            *id = format!("{name} {}", mark(folder));
+        }
+        for name in twice {
+            let note = format!(
+                "{name}: a task has several runs of one seed with different settings or data; each is a column of its own."
+            );
+            if !notes.contains(&note) {
+                notes.push(note);
+            }
+        }
+    }
+    ids
+}
+
+fn json(path: &Path) -> Option<Value> {
+    serde_json::from_slice(&fs::read(path).ok()?).ok()
+}
+
+/// What the trainings of score networks under `root` cost, by the stage's name. A stage that cannot be read has no time: the runs
+/// are what counts.
+fn networks(root: &Path) -> BTreeMap<String, Cost> {
+    let stages = directories(&root.join("stages")).unwrap_or_default();
+    let cost = |stage: &PathBuf| {
+        let name = name_of(stage);
+        let spec = json(&stage.join("spec.json")).filter(|_| name.starts_with("networks-"))?;
+        let seconds = json(&stage.join("done.json"))?["summary"]["seconds"].as_f64().filter(|s| *s >= 0.0)?;
+        let agent = parse_agent(spec["spec"]["inputs"]["agent"].as_str()?).ok()?;
+        let seeds = spec["spec"]["seeds"].as_array().map_or(1, Vec::len);
+        Some((name, Cost { stage: "Score networks".into(), agent, seconds, seeds, memory: None }))
+    };
+    stages.iter().filter_map(cost).collect()
+}
+
+/// The networks that the rows of a stage were generated by.
+fn networks_of(generated: &Path) -> Option<String> {
+    Some(json(&generated.join("spec.json"))?["spec"]["networks"].as_str()?.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn folders_name_their_task() {
+        for task in Task::all() {
+            assert_eq!(task_of(Path::new(&task.directory())), Some(task));
+        }
+        assert_eq!(task_of(Path::new("stages")), None);
+        assert_eq!(task_of(Path::new("sac-from")), None);
+    }
+
+    #[test]
+    fn all_floors_come_first() {
+        let methods =
+            in_order(vec![method(Variant::TceOg, ""), method(Variant::Bc, "y0.1"), method(Variant::BcRaw, "")]);
+        let ids: Vec<&str> = methods.iter().map(|m| m.id.as_str()).collect();
+        assert_eq!(ids, ["bc-raw", "bc y0.1", "bc-top", "target-only", "tce-og"]);
+    }
+}
