@@ -33,8 +33,8 @@ fn task(task: Task) -> tce_report::Task {
 fn method(variant: Variant, label: &str) -> Method {
     let floor = Variant::FLOORS.contains(&variant);
     let (id, title) = match label {
-        "" => (variant.name(), variant.title().to_owned()),
-        label => (format!("{variant} {label}"), format!("{}, {label}", variant.title())),
+        "" => (variant.name(), variant.own_title()),
+        label => (format!("{variant} {label}"), format!("{}, {label}", variant.own_title())),
     };
     Method { id, title, variant: variant.name(), floor, plain: label.is_empty() }
 }

@@ -109,6 +109,12 @@ impl Variant {
         }
     }
 
+    /// The name in tables of a row whose configuration is the variant's own.
+    pub fn own_title(self) -> String {
+        let published = if self.name().ends_with("-published") { " (published)" } else { "" };
+        format!("{}{published}", self.title())
+    }
+
     /// The name in tables of a row that `config` decides: its learner, if that is not the variant's own, and its mode.
     pub fn row_title(self, config: &Config) -> String {
         let own = Layered::new(Preset::Default, None, Some(self), None, &[]).and_then(|l| l.config());
