@@ -1,5 +1,6 @@
 //! Files that are either whole or absent: written beside their final place, flushed to disk, then renamed.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -86,6 +87,18 @@ fn flush_directory(path: &Path) -> Result<(), FileError> {
     #[cfg(not(unix))]
     let _ = path;
     Ok(())
+}
+
+/// The first of `files`, names below `directory` with their SHA-256, that is not what it was, and how; none if all are.
+pub fn first_damaged(directory: &Path, files: &BTreeMap<String, String>) -> Option<String> {
+    files.iter().find_map(|(name, expected)| {
+        let file = directory.join(name);
+        match sha256_file(&file) {
+            Ok(found) if found == *expected => None,
+            Ok(found) => Some(format!("{}: SHA-256 {found}, expected {expected}", file.display())),
+            Err(e) => Some(e.to_string()),
+        }
+    })
 }
 
 /// Gives the complete file `own`, flushed to disk, the name `target` on the same file system, in place of what had it.

@@ -7,8 +7,8 @@ pub mod random;
 pub mod sealed;
 
 pub use files::{
-    AtomicFile, FileError, link_first, move_into_place, read_if_there, sha256_file, sha256_hex, write_atomically,
-    write_json,
+    AtomicFile, FileError, first_damaged, link_first, move_into_place, read_if_there, sha256_file, sha256_hex,
+    write_atomically, write_json,
 };
 pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
 pub use random::{Rng, Streams};

@@ -8,6 +8,7 @@
 //! | What is in it? | [`inspect`], [`check`](check()), [`infer_agents`], [`ensure_same_agent`] |
 //! | In which units does a network see it? | [`Standardizer`] |
 //! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
+//! | Which transfer problems are there? | [`Task`] |
 //! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
 //! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
 //!
@@ -27,6 +28,7 @@ mod quality;
 mod reference;
 mod rows;
 mod standardise;
+mod task;
 mod transitions;
 mod transport;
 
@@ -42,5 +44,6 @@ pub use quality::Quality;
 pub use reference::{ReferenceScores, ScoreTable, Shift, reference_scores};
 pub use rows::Rows;
 pub use standardise::{RELATIVE_FLOOR, Standardizer};
+pub use task::{Task, parse_agent, parse_environment};
 pub use transitions::{Agent, Episode, Transitions};
 pub use transport::{TransportOptions, transport_costs};

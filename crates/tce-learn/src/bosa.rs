@@ -28,20 +28,19 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
+use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
 
 use crate::actor::ActorConfig;
 use crate::buffer::{Buffer, Minibatch};
-use crate::critic::Twins;
+use crate::critic::state_action;
 use crate::cvae::{Cvae, CvaeConfig, CvaeLearner, Density, Modelled};
-use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, squared_td_error};
 use crate::mode::Mode;
-use crate::policy::Policy;
 use crate::selection::need_others;
 use crate::td3_bc::normalised_value;
-use crate::training::{Learner, Meter, Place, PolicyLearner, prepare};
+use crate::training::{Learner, Meter, Place, prepare};
 
 /// The configuration of [`Bosa`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -150,10 +149,11 @@ impl Learner for Autoencoders {
 }
 
 /// BOSA of a population.
-pub struct Bosa {
+pub type Bosa = Deterministic<Support>;
+
+/// β̂ and p̂_1..n, and what they are asked for.
+pub struct Support {
     config: BosaConfig,
-    actor: DelayedActor,
-    critics: Twins,
     behaviour: Cvae,
     dynamics: Vec<Cvae>,
     members: Vec<Streams>,
@@ -185,17 +185,19 @@ impl Bosa {
             return Ok(None);
         }
         let mut models = autoencoders.all.iter().map(CvaeLearner::model);
-        let (inputs, train) = (buffer.inputs().len(), device.clone().autodiff());
-        Ok(Some(Self {
-            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
-            critics: Twins::new(inputs, buffer.act_dim(), &config.hidden, &buffer.streams(), &train),
+        let critic = MlpConfig::relu(buffer.inputs().len() + buffer.act_dim(), &config.hidden, 1);
+        let nets = ActorCritic::new(buffer, &config.actor, &config.delay, &critic, steps, device)?;
+        let rule = Support {
             behaviour: models.next().expect("the first of them"),
             dynamics: models.collect(),
             members: buffer.streams(),
             config: config.clone(),
-        }))
+        };
+        Ok(Some(Deterministic { nets, rule }))
     }
+}
 
+impl Support {
     /// m `[P, B, 1]`.
     fn supported(&self, batch: &Minibatch, step: u64) -> Tensor<3> {
         let (c, x) = Modelled::Dynamics.split(batch);
@@ -218,56 +220,37 @@ pub fn critic_target(batch: &Minibatch, q: Tensor<3>, discount: f64, mode: Mode)
     batch.r.clone() + bootstrap * q * discount
 }
 
-impl Learner for Bosa {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
+impl Rule for Support {
+    fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, behaviour, members, .. } = self;
         let (mask, y) = rayon::join(
             || self.supported(batch, step),
             || {
-                let a2 = self.actor.next_action(batch.s2.clone(), step);
-                let q = self.critics.lesser_target(join(&batch.s2, a2));
-                critic_target(batch, q, self.config.discount, self.config.mode)
+                let q = nets.next_value(batch.s2.clone(), nets.next_action(batch.s2.clone(), step));
+                critic_target(batch, q, c.discount, c.mode)
             },
         );
         meter.record("supported", &mask);
-        let Self { config: c, actor, critics, behaviour, members, .. } = self;
         let (first, others) = (batch.target_rows, batch.s.dims()[1] - batch.target_rows);
         let loss = |q: Tensor<3>| {
             let source = member_mean(q.clone().narrow(1, first, others));
             squared_td_error(q, y.clone(), Some(mask.clone())) * 0.5 + source * c.value_weight
         };
-        let loss = critics.step_down(join(&batch.s, batch.a.clone()), loss, c.critic_lr, actor.polyak(step));
+        let polyak = nets.polyak(step);
+        let loss = nets.critics.step_down(state_action(&batch.s, batch.a.clone()), loss, c.critic_lr, polyak);
         meter.record("critic_loss", &loss);
-        if actor.due(step) {
-            let a = actor.forward(batch.s.clone()).mean;
+        if nets.due(step) {
+            let a = nets.forward(batch.s.clone()).mean;
             let (q, density) = rayon::join(
-                || critics.pair[0].frozen(join(&batch.s, a.clone())),
+                || nets.critics.pair[0].frozen(state_action(&batch.s, a.clone())),
                 || behaviour.log_density(batch.s.clone(), a.clone(), c.density(), members, "bosa support", step),
             );
             drop(a);
             meter.record("policy_value", &q);
             meter.record("policy_support", &density);
             let loss = -normalised_value(q) - member_mean(density) * c.support_weight;
-            actor.step(loss, step);
+            nets.step(loss, step);
         }
-    }
-
-    fn state(&self) -> NamedParameters {
-        let mut state = NamedParameters::default();
-        self.actor.save(&mut state);
-        self.critics.save(&mut state);
-        state
-    }
-
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.actor.load(state, path)?;
-        self.critics.load(state, path)
-    }
-}
-
-impl PolicyLearner for Bosa {
-    fn policies(&self) -> Vec<Policy> {
-        self.actor.policies()
     }
 }
 

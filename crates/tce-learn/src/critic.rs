@@ -16,6 +16,11 @@ use tce_nn::{Averaged, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkE
 
 use crate::losses::squared_td_error;
 
+/// [s, a], what critics are asked about.
+pub fn state_action(s: &Tensor<3>, a: Tensor<3>) -> Tensor<3> {
+    Tensor::cat(vec![s.clone(), a], 2)
+}
+
 /// A critic and the network that follows it.
 pub struct Critic {
     name: &'static str,

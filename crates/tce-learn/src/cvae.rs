@@ -28,6 +28,7 @@ use tce_nn::{Activation, Device, Mlp, MlpConfig, Module, NamedParameters, Networ
 
 use crate::blocks::map_rows;
 use crate::buffer::{Buffer, Minibatch};
+use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::losses::{kl_to_standard_normal, member_mean, normal_log_prob, squared_error};
 use crate::training::{Learner, Meter, Place, member_noise, prepare};
@@ -73,7 +74,7 @@ impl Modelled {
     pub fn split(self, batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
         match self {
             Modelled::Behaviour => (batch.s.clone(), batch.a.clone()),
-            Modelled::Dynamics => (Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2), batch.s2.clone()),
+            Modelled::Dynamics => (state_action(&batch.s, batch.a.clone()), batch.s2.clone()),
         }
     }
 }

@@ -23,19 +23,19 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
 use tce_nn::burn::tensor::activation::{log_softmax, softmax};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::buffer::{Buffer, Minibatch};
+use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::losses::member_mean;
 use crate::mode::Mode;
-use crate::policy::Policy;
+use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::need_others;
-use crate::training::{Learner, Meter, PolicyLearner, member_noise};
+use crate::training::{Meter, member_noise};
 
 /// Added to a probability before its logarithm (ODRL).
 const TINY: f64 = 1e-10;
@@ -78,15 +78,15 @@ impl DaraConfig {
 }
 
 /// DARA of a population.
-pub struct Dara {
+pub type Dara = OnIql<Classifiers>;
+
+/// C_sas and C_sa.
+pub struct Classifiers {
     config: DaraConfig,
-    iql: Iql,
     sas: Trained<Mlp>,
     sa: Trained<Mlp>,
-    /// The classifiers draw batches of their own.
+    /// They draw batches of their own.
     buffer: Buffer,
-    members: Vec<Streams>,
-    device: Device,
 }
 
 impl Dara {
@@ -109,15 +109,13 @@ impl Dara {
         let classifier = |name: &str, inputs: usize| {
             Trained::new(MlpConfig::relu(inputs, &config.hidden, 2).init(&members, name, &train))
         };
-        Ok(Self {
-            iql: Iql::new(buffer, iql, regulariser, steps, device)?,
+        let shape = Classifiers {
             sas: classifier("dara sas", 2 * s + a),
             sa: classifier("dara sa", s + a),
             buffer: buffer.clone().with_stream("dara batch"),
             config: config.clone(),
-            members,
-            device: device.clone(),
-        })
+        };
+        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape })
     }
 }
 
@@ -142,14 +140,15 @@ pub fn dynamics_gap(sas: Tensor<3>, sa: Tensor<3>) -> Tensor<3> {
 }
 
 fn join(batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
-    let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
+    let sa = state_action(&batch.s, batch.a.clone());
     (Tensor::cat(vec![sa.clone(), batch.s2.clone()], 2), sa)
 }
 
-impl Learner for Dara {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, sas, sa, members, device, .. } = self;
-        let rows = self.buffer.sample(step, device);
+impl Shape for Classifiers {
+    fn shape(&mut self, _iql: &Iql, batch: &Minibatch, step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+        let Self { config: c, sas, sa, buffer } = self;
+        let (members, device) = (&buffer.streams(), &batch.s.device());
+        let rows = buffer.sample(step, device);
         let (x, y) = join(&rows);
         let train = |net: &mut Trained<Mlp>, x: Tensor<3>, name: &str| {
             let noise = member_noise(members, name, step, x.dims(), device);
@@ -168,26 +167,17 @@ impl Learner for Dara {
         let gap = gap.clamp(-c.clip, c.clip);
         meter.record("dynamics_gap", &gap);
         let r = Tensor::cat(vec![batch.r.clone().narrow(1, 0, first), source(batch.r.clone()) + gap * c.eta], 1);
-        self.iql.step(&Minibatch { r, ..batch.clone() }, None, step, meter);
+        (Minibatch { r, ..batch.clone() }, None)
     }
 
-    fn state(&self) -> NamedParameters {
-        let mut state = self.iql.state();
-        self.sas.save("dara sas", &mut state);
-        self.sa.save("dara sa", &mut state);
-        state
+    fn save(&self, state: &mut NamedParameters) {
+        self.sas.save("dara sas", state);
+        self.sa.save("dara sa", state);
     }
 
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.iql.restore(state, path)?;
+    fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         self.sas.load("dara sas", state, path)?;
         self.sa.load("dara sa", state, path)
-    }
-}
-
-impl PolicyLearner for Dara {
-    fn policies(&self) -> Vec<Policy> {
-        self.iql.policies()
     }
 }
 

@@ -16,13 +16,14 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_nn::{Averaged, Device, NamedParameters, NetworkError, Tensor};
+use tce_nn::{Averaged, Device, MlpConfig, NamedParameters, NetworkError, Tensor};
 
 use crate::actor::{Actor, ActorConfig, ActorNet, PolicyForm, PolicyOutput};
-use crate::buffer::Buffer;
+use crate::buffer::{Buffer, Minibatch};
+use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::policy::Policy;
-use crate::training::member_noise;
+use crate::training::{Learner, Meter, PolicyLearner, member_noise};
 
 /// Smoothing and delay; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,16 +58,18 @@ impl DelayConfig {
     }
 }
 
-/// π and π' of a population.
-pub struct DelayedActor {
+/// π, π', Q and Q' of a population.
+pub struct ActorCritic {
     config: DelayConfig,
     actor: Actor,
     target: Averaged<ActorNet>,
+    /// Q and Q'.
+    pub critics: Twins,
     members: Vec<Streams>,
 }
 
-impl DelayedActor {
-    /// New policies for the members of `buffer`, to be trained for `steps` steps.
+impl ActorCritic {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps; `critic` is a network on [s, a].
     ///
     /// # Errors
     /// If a configuration cannot be used.
@@ -74,12 +77,20 @@ impl DelayedActor {
         buffer: &Buffer,
         actor: &ActorConfig,
         config: &DelayConfig,
+        critic: &MlpConfig,
         steps: u64,
         device: &Device,
     ) -> Result<Self, LearnError> {
         config.check()?;
         let actor = Actor::new(buffer, &ActorConfig { form: PolicyForm::TanhMean, ..actor.clone() }, steps, device)?;
-        Ok(Self { config: config.clone(), target: actor.follower(), actor, members: buffer.streams() })
+        let members = buffer.streams();
+        Ok(Self {
+            config: config.clone(),
+            target: actor.follower(),
+            actor,
+            critics: Twins::with(critic, &members, &device.clone().autodiff()),
+            members,
+        })
     }
 
     /// a' at s' `[P, B, inputs]`, no part of autodiff; the noise is that of `step`.
@@ -87,6 +98,11 @@ impl DelayedActor {
         let a = self.actor.followed(&self.target, s2);
         let noise = member_noise(&self.members, "target noise", step, a.dims(), &a.device()) * self.config.std;
         (a + noise.clamp(-self.config.clip, self.config.clip)).clamp(-1.0, 1.0)
+    }
+
+    /// min(Q1', Q2')(s', a'), no part of autodiff.
+    pub fn next_value(&self, s2: Tensor<3>, a2: Tensor<3>) -> Tensor<3> {
+        self.critics.lesser_target(state_action(&s2, a2))
     }
 
     /// Whether the policy is trained at `step`, counted from 0: the d-th, 2d-th, ...
@@ -109,23 +125,49 @@ impl DelayedActor {
         self.actor.step_averaged(loss, step, &mut self.target, self.config.polyak);
     }
 
-    /// The policies as they are.
-    pub fn policies(&self) -> Vec<Policy> {
-        self.actor.policies()
-    }
-
-    /// Adds parameters and optimiser to `state`.
-    pub fn save(&self, state: &mut NamedParameters) {
+    fn save(&self, state: &mut NamedParameters) {
         self.actor.save(state);
         state.collect("target policy", self.target.net());
+        self.critics.save(state);
     }
 
-    /// Takes them from `state`; `path` is where it came from, for messages.
-    ///
-    /// # Errors
-    /// If they belong to another policy.
-    pub fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+    fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         self.actor.load(state, path)?;
-        self.target.load("target policy", state, path)
+        self.target.load("target policy", state, path)?;
+        self.critics.load(state, path)
+    }
+}
+
+/// How a method trains the networks of an [`ActorCritic`].
+pub trait Rule: Send {
+    /// One step; `step` counts from 0.
+    fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter);
+}
+
+/// An [`ActorCritic`] under a [`Rule`].
+pub struct Deterministic<R> {
+    pub(crate) nets: ActorCritic,
+    pub(crate) rule: R,
+}
+
+impl<R: Rule> Learner for Deterministic<R> {
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        self.rule.update(&mut self.nets, batch, step, meter);
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.nets.save(&mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.nets.load(state, path)
+    }
+}
+
+impl<R: Rule> PolicyLearner for Deterministic<R> {
+    fn policies(&self) -> Vec<Policy> {
+        self.nets.actor.policies()
     }
 }

@@ -28,21 +28,18 @@
 //! | c | [`crate::Member::row_scores`] | - | [`tce_data::density`] |
 //! | τ, β, cap, γ, ρ, networks | those of [`IqlConfig`] | - | OTDF |
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
-use tce_nn::{Device, NamedParameters, NetworkError};
+use tce_nn::{Device, Tensor};
 
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
-use crate::losses::member_mean;
 use crate::mode::Mode;
+use crate::on_iql::{OnIql, Shape};
 use crate::otdf::otdf_policy;
-use crate::policy::Policy;
 use crate::regulariser::{Regulariser, RegulariserConfig};
 use crate::selection::{Selected, need_scores, scores_of_others};
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::Meter;
 
 /// The configuration of [`Dmc`], besides [`IqlConfig`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -88,9 +85,11 @@ impl DmcConfig {
 }
 
 /// DmC's learner of a population.
-pub struct Dmc {
+pub type Dmc = OnIql<Scored>;
+
+/// The rows with the better scores.
+pub struct Scored {
     config: DmcConfig,
-    iql: Iql,
     members: Vec<Member>,
 }
 
@@ -111,30 +110,20 @@ impl Dmc {
         config.check()?;
         need_scores("DmC", buffer.members())?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(Self { config: config.clone(), iql, members: buffer.members().to_vec() })
+        Ok(OnIql { iql, shape: Scored { config: config.clone(), members: buffer.members().to_vec() } })
     }
 }
 
-impl Learner for Dmc {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
+impl Shape for Scored {
+    fn shape(
+        &mut self,
+        _iql: &Iql,
+        batch: &Minibatch,
+        _step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>) {
         let scores = scores_of_others(&self.members, batch);
-        let kept = Selected::new(batch, &scores, 1.0 - self.config.cut_off, |score| score);
-        meter.record("critic_weight", &member_mean(kept.weights.clone()));
-        self.iql.step(&kept.batch, Some(kept.weights), step, meter);
-    }
-
-    fn state(&self) -> NamedParameters {
-        self.iql.state()
-    }
-
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.iql.restore(state, path)
-    }
-}
-
-impl PolicyLearner for Dmc {
-    fn policies(&self) -> Vec<Policy> {
-        self.iql.policies()
+        Selected::new(batch, &scores, 1.0 - self.config.cut_off, |score| score).recorded(meter)
     }
 }
 

@@ -27,14 +27,15 @@ use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
 use crate::buffer::{Buffer, Minibatch};
+use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
-use crate::losses::{binary_cross_entropy, member_mean};
+use crate::losses::binary_cross_entropy;
 use crate::mode::Mode;
-use crate::policy::Policy;
+use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{Selected, host_from, need_others};
-use crate::training::{Learner, Meter, Place, PolicyLearner, prepare};
+use crate::training::{Learner, Meter, Place, prepare};
 
 /// The configuration of [`Igdf`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -87,7 +88,7 @@ struct Pair {
 }
 
 /// φ and ψ of a population, as they are trained.
-struct Encoders {
+pub struct Encoders {
     config: IgdfConfig,
     pair: Trained<Pair>,
 }
@@ -105,7 +106,7 @@ impl Encoders {
 
     /// cos(φ(s, a), ψ(s')) of the rows that are not target rows, members one after the other.
     fn scores(&self, batch: &Minibatch) -> Vec<f32> {
-        let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
+        let sa = state_action(&batch.s, batch.a.clone());
         let pair = self.pair.net().valid();
         host_from(cosine(pair.phi.forward(sa), pair.psi.forward(batch.s2.clone())), batch.target_rows)
     }
@@ -131,7 +132,7 @@ pub fn contrast(phi: Tensor<3>, psi: Tensor<3>, others: Tensor<3>) -> Tensor<3> 
 impl Learner for Encoders {
     fn update(&mut self, batch: &Minibatch, _step: u64, meter: &mut Meter) {
         let (n, rows) = (batch.target_rows, batch.s.dims()[1]);
-        let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2).narrow(1, 0, n);
+        let sa = state_action(&batch.s, batch.a.clone()).narrow(1, 0, n);
         let phi = self.pair.net().phi.forward(sa);
         let psi = self.pair.net().psi.forward(batch.s2.clone());
         let loss = contrast(phi, psi.clone().narrow(1, 0, n), psi.narrow(1, n, rows - n));
@@ -141,20 +142,17 @@ impl Learner for Encoders {
 
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
-        self.pair.save("igdf", &mut state);
+        self.save(&mut state);
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.pair.load("igdf", state, path)
+        self.load(state, path)
     }
 }
 
 /// IGDF of a population.
-pub struct Igdf {
-    encoders: Encoders,
-    iql: Iql,
-}
+pub type Igdf = OnIql<Encoders>;
 
 impl Igdf {
     /// New networks for the members of `buffer`, to be trained for `steps` steps; φ and ψ are trained here. None if the user
@@ -181,34 +179,28 @@ impl Igdf {
                 return Ok(None);
             }
         }
-        Ok(Some(Self { encoders, iql: Iql::new(buffer, iql, regulariser, steps, device)? }))
+        Ok(Some(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape: encoders }))
     }
 }
 
-impl Learner for Igdf {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let c = &self.encoders.config;
-        let weight = c.weight as f32;
-        let kept = Selected::new(batch, &self.encoders.scores(batch), c.keep, |score| (weight * score).exp());
-        meter.record("critic_weight", &member_mean(kept.weights.clone()));
-        self.iql.step(&kept.batch, Some(kept.weights), step, meter);
+impl Shape for Encoders {
+    fn shape(
+        &mut self,
+        _iql: &Iql,
+        batch: &Minibatch,
+        _step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>) {
+        let (keep, weight) = (self.config.keep, self.config.weight as f32);
+        Selected::new(batch, &self.scores(batch), keep, |score| (weight * score).exp()).recorded(meter)
     }
 
-    fn state(&self) -> NamedParameters {
-        let mut state = self.iql.state();
-        self.encoders.pair.save("igdf", &mut state);
-        state
+    fn save(&self, state: &mut NamedParameters) {
+        self.pair.save("igdf", state);
     }
 
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.encoders.restore(state, path)?;
-        self.iql.restore(state, path)
-    }
-}
-
-impl PolicyLearner for Igdf {
-    fn policies(&self) -> Vec<Policy> {
-        self.iql.policies()
+    fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.pair.load("igdf", state, path)
     }
 }
 

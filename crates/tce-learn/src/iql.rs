@@ -37,7 +37,7 @@ use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tens
 
 use crate::actor::{Actor, ActorConfig, PolicyForm, PolicyOutput};
 use crate::buffer::{Buffer, Minibatch, RewardScale};
-use crate::critic::Twins;
+use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::losses::{AdvantageScale, AdvantageWeights, advantage_weights, expectile_loss, member_mean};
 use crate::policy::Policy;
@@ -190,7 +190,7 @@ impl Iql {
     /// One update of all networks. `critic_weights` `[P, B, 1]` multiply the rows of L_Q.
     pub fn step(&mut self, batch: &Minibatch, critic_weights: Option<Tensor<3>>, step: u64, meter: &mut Meter) {
         let Self { config, actor, value, critics, regulariser } = self;
-        let sa = Tensor::cat(vec![batch.s.clone(), batch.a.clone()], 2);
+        let sa = state_action(&batch.s, batch.a.clone());
         // Where there are two threads, one computes value and a critic, the other policy and a critic; they meet in u, in y
         // and at the end: 8 of 15 network passes instead of 15 (a gradient counts as two).
         let ((q1, v), (q2, output)) = {

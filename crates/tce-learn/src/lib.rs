@@ -9,7 +9,7 @@
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
 //! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
-//! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`] |
+//! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
 //! | choosing among a batch's rows | [`selection`] |
 //! | DmC: scored rows, filtered and weighed | [`dmc`] |
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
@@ -36,6 +36,7 @@ pub mod meta_dt;
 mod mlp_policy;
 mod mode;
 mod networks;
+pub mod on_iql;
 pub mod otdf;
 pub mod pair_model;
 mod policy;

@@ -43,7 +43,7 @@ use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
 use crate::sequences::{Segments, Trajectories};
 use crate::training::{Learner, Meter, PolicyLearner};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
-use crate::world_model::{Contexts, Place, SegmentTensors, WorldModel, WorldModelConfig, strip};
+use crate::world_model::{Contexts, Of, SegmentTensors, WorldModel, WorldModelConfig, strip};
 
 /// The configuration of [`MetaDt`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -209,14 +209,14 @@ impl MemberNets {
     }
 
     /// π at the steps of `segments`, `[B, K, A]`.
-    fn actions(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<3> {
+    fn actions(&mut self, segments: &Segments, of: Of, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<3> {
         let encoder = self.world.net().encoder.valid();
-        let contexts = self.contexts.of(segments, c.context, &encoder, &self.trajectories, place);
-        let batch = SegmentTensors::new(segments, c.context, place.device);
+        let contexts = self.contexts.of(segments, c.context, &encoder, &self.trajectories, of);
+        let batch = SegmentTensors::new(segments, c.context, of.device);
         let shape = [c.batch, c.context];
         let on_device = |v: Vec<f32>| {
             let width = v.len() / (c.batch * c.context);
-            tensor(v, [c.batch, c.context, width], place.device)
+            tensor(v, [c.batch, c.context, width], of.device)
         };
         let times: Vec<i32> = segments.times.iter().map(|t| (*t).min(c.timesteps as i32 - 1)).collect();
         let input = TransformerInput {
@@ -224,17 +224,17 @@ impl MemberNets {
             states: batch.s,
             contexts: on_device(contexts),
             actions: batch.a,
-            times: Tensor::<2, Int>::from_data(TensorData::new(times, shape), place.device),
+            times: Tensor::<2, Int>::from_data(TensorData::new(times, shape), of.device),
         };
         self.transformer.net().forward(input, dropout)
     }
 
     /// L_π of `segments`, `[1]`.
-    fn policy_loss(&mut self, segments: &Segments, place: Place, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<1> {
-        let actions = self.actions(segments, place, c, dropout);
+    fn policy_loss(&mut self, segments: &Segments, of: Of, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<1> {
+        let actions = self.actions(segments, of, c, dropout);
         let [b, k, width] = actions.dims();
-        let data = tensor(segments.actions.clone(), [b, k, width], place.device);
-        let valid = tensor(segments.valid.clone(), [b, k, 1], place.device);
+        let data = tensor(segments.actions.clone(), [b, k, width], of.device);
+        let valid = tensor(segments.valid.clone(), [b, k, 1], of.device);
         let numbers = segments.valid.iter().sum::<f32>() * width as f32;
         ((actions - data).square() * valid).sum() / numbers
     }
@@ -250,8 +250,8 @@ impl Learner for MetaDt {
             if let Some(step) = step.checked_sub(w.steps) {
                 let segments = nets.trajectories.sample(buffer, m, w.steps + step, [c.batch, c.context, 0]);
                 let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
-                let place = Place { buffer, member: m, device };
-                let loss = nets.policy_loss(&segments, place, c, &mut dropout);
+                let of = Of { buffer, member: m, device };
+                let loss = nets.policy_loss(&segments, of, c, &mut dropout);
                 figures[0].push(host(loss.clone())[0] as f64);
                 nets.transformer.step(loss, c.rate(step));
             } else {
@@ -367,8 +367,8 @@ mod tests {
         let MetaDt { config: c, buffer, members, device } = &mut learner;
         let nets = &mut members[0];
         let segments = nets.trajectories.sample(buffer, 0, 11, [c.batch, c.context, 0]);
-        let place = Place { buffer, member: 0, device };
-        let loss = host(nets.policy_loss(&segments, place, c, &mut Dropout::none()))[0];
+        let of = Of { buffer, member: 0, device };
+        let loss = host(nets.policy_loss(&segments, of, c, &mut Dropout::none()))[0];
         let begin = |row: usize| [0, 7, 8].into_iter().rfind(|b| *b <= row).unwrap();
         let rows = segments.picks.iter().flat_map(|p| {
             let row = p.row as usize;
@@ -378,7 +378,7 @@ mod tests {
         // The policy sees three steps, a segment's later steps as well; a segment that begins within an episode sees fewer.
         let whole: Vec<_> = segments.picks.iter().map(|p| p.row as usize).collect();
         assert!(rows.len() > whole.len());
-        let per_step = host(nets.actions(&segments, place, c, &mut Dropout::none()));
+        let per_step = host(nets.actions(&segments, of, c, &mut Dropout::none()));
         for (k, row) in whole.into_iter().enumerate() {
             let last = segments.valid[3 * k..][..3].iter().filter(|v| **v > 0.0).count() - 1;
             let own = &per_step[(3 * k + last) * 2..][..2];

@@ -21,21 +21,18 @@
 //! no effect on which action is cloned ([`PolicyExtraction::MeanWeight`]).
 //! OTDF's loader also takes the next row for s', across the ends of episodes; this is not repeated here.
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
-use tce_nn::{Device, NamedParameters, NetworkError};
+use tce_nn::{Device, Tensor};
 
 use crate::actor::ActionReduction;
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig, PolicyExtraction};
-use crate::losses::member_mean;
 use crate::mode::Mode;
-use crate::policy::Policy;
+use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::{Regulariser, RegulariserKind};
 use crate::selection::{Selected, need_scores, scores_of_others};
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::Meter;
 
 /// The configuration of [`Otdf`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -86,9 +83,11 @@ pub(crate) fn otdf_policy(iql: &IqlConfig, mode: Mode, beta_reg: f64) -> IqlConf
 }
 
 /// OTDF of a population.
-pub struct Otdf {
+pub type Otdf = OnIql<Transported>;
+
+/// The source rows that are cheap to transport.
+pub struct Transported {
     config: OtdfConfig,
-    iql: Iql,
     members: Vec<Member>,
 }
 
@@ -108,7 +107,7 @@ impl Otdf {
         config.check()?;
         need_scores("OTDF", buffer.members())?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(Self { config: config.clone(), iql, members: buffer.members().to_vec() })
+        Ok(OnIql { iql, shape: Transported { config: config.clone(), members: buffer.members().to_vec() } })
     }
 }
 
@@ -121,28 +120,18 @@ pub fn normalise(d: &mut [f32], others: usize) {
     }
 }
 
-impl Learner for Otdf {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, iql, members } = self;
-        let mut d = scores_of_others(members, batch);
+impl Shape for Transported {
+    fn shape(
+        &mut self,
+        _iql: &Iql,
+        batch: &Minibatch,
+        _step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>) {
+        let c = &self.config;
+        let mut d = scores_of_others(&self.members, batch);
         normalise(&mut d, batch.s.dims()[1] - batch.target_rows);
-        let kept = Selected::new(batch, &d, c.keep, |d| if c.weighted { d.exp() } else { 1.0 });
-        meter.record("critic_weight", &member_mean(kept.weights.clone()));
-        iql.step(&kept.batch, Some(kept.weights), step, meter);
-    }
-
-    fn state(&self) -> NamedParameters {
-        self.iql.state()
-    }
-
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.iql.restore(state, path)
-    }
-}
-
-impl PolicyLearner for Otdf {
-    fn policies(&self) -> Vec<Policy> {
-        self.iql.policies()
+        Selected::new(batch, &d, c.keep, |d| if c.weighted { d.exp() } else { 1.0 }).recorded(meter)
     }
 }
 

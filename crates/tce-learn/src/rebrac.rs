@@ -19,19 +19,16 @@
 //! | - | `critic_lr`, `actor.lr` | 3e-4 | theirs: 1e-3 at batches of 1024; ours are those of the other methods |
 //! | - | `hidden` | 256, 256, 256 ReLU, critics with layer normalisation | theirs |
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
-use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
+use tce_nn::{Device, MlpConfig};
 
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
-use crate::critic::Twins;
-use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::critic::state_action;
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
-use crate::policy::Policy;
 use crate::td3_bc::normalised_value;
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::Meter;
 
 /// The configuration of [`Rebrac`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -83,10 +80,11 @@ impl RebracConfig {
 }
 
 /// ReBRAC of a population.
-pub struct Rebrac {
+pub type Rebrac = Deterministic<Penalties>;
+
+/// The penalties of both sides.
+pub struct Penalties {
     config: RebracConfig,
-    actor: DelayedActor,
-    critics: Twins,
     /// Where the next actions are looked up.
     buffer: Buffer,
 }
@@ -99,31 +97,28 @@ impl Rebrac {
     pub fn new(buffer: &Buffer, config: &RebracConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
         config.check()?;
         let critic = MlpConfig::relu(buffer.inputs().len() + buffer.act_dim(), &config.hidden, 1).with_layer_norm();
-        Ok(Self {
-            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
-            critics: Twins::with(&critic, &buffer.streams(), &device.clone().autodiff()),
-            buffer: buffer.clone(),
-            config: config.clone(),
-        })
+        let nets = ActorCritic::new(buffer, &config.actor, &config.delay, &critic, steps, device)?;
+        Ok(Deterministic { nets, rule: Penalties { config: config.clone(), buffer: buffer.clone() } })
     }
 }
 
-impl Learner for Rebrac {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, actor, critics, buffer } = self;
-        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
-        let a2 = actor.next_action(batch.s2.clone(), step);
+impl Rule for Penalties {
+    fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, buffer } = self;
+        let a2 = nets.next_action(batch.s2.clone(), step);
         let (data, known) = buffer.next_actions(batch);
         let penalty = (a2.clone() - data).square().sum_dim(2) * known;
         meter.record("critic_penalty", &penalty);
-        let q = critics.lesser_target(join(&batch.s2, a2)) - penalty * c.critic_penalty;
+        let q = nets.next_value(batch.s2.clone(), a2) - penalty * c.critic_penalty;
         let y = batch.r.clone() + batch.not_done.clone() * q * c.discount;
-        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.critic_lr, actor.polyak(step));
+        let sa = state_action(&batch.s, batch.a.clone());
+        let polyak = nets.polyak(step);
+        let loss = nets.critics.step(sa, y, None, c.critic_lr, polyak);
         meter.record("critic_loss", &loss);
-        if actor.due(step) {
-            let output = actor.forward(batch.s.clone());
-            let sa = join(&batch.s, output.mean.clone());
-            let [one, two] = &critics.pair;
+        if nets.due(step) {
+            let output = nets.forward(batch.s.clone());
+            let sa = state_action(&batch.s, output.mean.clone());
+            let [one, two] = &nets.critics.pair;
             let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));
             let q = q1.min_pair(q2);
             drop(sa);
@@ -133,25 +128,7 @@ impl Learner for Rebrac {
             meter.record("cloning_loss", &cloning);
             let loss = cloning * c.actor_penalty - normalised_value(q);
             drop(output);
-            actor.step(loss, step);
+            nets.step(loss, step);
         }
-    }
-
-    fn state(&self) -> NamedParameters {
-        let mut state = NamedParameters::default();
-        self.actor.save(&mut state);
-        self.critics.save(&mut state);
-        state
-    }
-
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.actor.load(state, path)?;
-        self.critics.load(state, path)
-    }
-}
-
-impl PolicyLearner for Rebrac {
-    fn policies(&self) -> Vec<Policy> {
-        self.actor.policies()
     }
 }

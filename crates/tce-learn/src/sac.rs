@@ -29,7 +29,7 @@ use tce_nn::{Device, Module, NamedParameters, NetworkError, Tensor, Trained, hos
 
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
-use crate::critic::Twins;
+use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
 use crate::policy::Policy;
@@ -126,13 +126,12 @@ impl Learner for Sac {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, target_entropy, actor, critics, temperature, members, .. } = self;
         let alpha = temperature.net().log_alpha.val().inner().exp();
-        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
 
         // L_Q; the policy at s is computed meanwhile, for it needs nothing of it.
         let (y, (output, drawn)) = rayon::join(
             || {
                 let (a2, log_prob) = actor.frozen(batch.s2.clone()).sample_with_log_prob(members, "next action", step);
-                let (s2a2, [one, two]) = (join(&batch.s2, a2), &critics.pair);
+                let (s2a2, [one, two]) = (state_action(&batch.s2, a2), &critics.pair);
                 let q = one.target(s2a2.clone()).min_pair(two.target(s2a2));
                 batch.r.clone() + batch.not_done.clone() * (q - alpha.clone() * log_prob) * c.discount
             },
@@ -143,12 +142,12 @@ impl Learner for Sac {
             },
         );
         drop(output);
-        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.lr, c.polyak);
+        let loss = critics.step(state_action(&batch.s, batch.a.clone()), y, None, c.lr, c.polyak);
         meter.record("critic_loss", &loss);
 
         // L_π: gradients reach the action through the critics, whose weights stay.
         let (a, log_prob) = drawn;
-        let sa = join(&batch.s, a);
+        let sa = state_action(&batch.s, a);
         let [one, two] = &critics.pair;
         let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));
         drop(sa);

@@ -4,6 +4,8 @@ use tce_nn::{Tensor, host, tensor};
 
 use crate::buffer::Minibatch;
 use crate::error::LearnError;
+use crate::losses::member_mean;
+use crate::training::Meter;
 
 /// So many of `others` rows are kept at the share `keep`: ⌊keep · others⌋, at least one.
 pub fn kept_rows(keep: f64, others: usize) -> usize {
@@ -44,6 +46,12 @@ impl Selected {
             (rows.iter().enumerate()).flat_map(|(m, rows)| rows.iter().map(move |i| (m, i))).map(weigh).collect();
         let kept = rows[0].len();
         Self { weights: tensor(weights, [p, kept, 1], &batch.s.device()), batch: batch.keep(&rows) }
+    }
+
+    /// As [`crate::on_iql::Shape`] hands it on; the mean weight goes to `meter`.
+    pub(crate) fn recorded(self, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+        meter.record("critic_weight", &member_mean(self.weights.clone()));
+        (self.batch, Some(self.weights))
     }
 }
 

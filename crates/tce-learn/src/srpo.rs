@@ -28,10 +28,10 @@ use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::losses::binary_cross_entropy;
 use crate::mode::Mode;
-use crate::policy::Policy;
+use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{best_others, kept_rows};
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::Meter;
 
 /// The configuration of [`Srpo`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -71,10 +71,12 @@ impl SrpoConfig {
 }
 
 /// SRPO of a population.
-pub struct Srpo {
+pub type Srpo = OnIql<Discriminator>;
+
+/// D.
+pub struct Discriminator {
     config: SrpoConfig,
-    iql: Iql,
-    discriminator: Trained<Mlp>,
+    net: Trained<Mlp>,
 }
 
 impl Srpo {
@@ -93,8 +95,8 @@ impl Srpo {
         config.check()?;
         let net = MlpConfig::relu(buffer.inputs().len(), &config.hidden, 1);
         let net = net.init(&buffer.streams(), "srpo", &device.clone().autodiff());
-        let iql = Iql::new(buffer, iql, regulariser, steps, device)?;
-        Ok(Self { config: config.clone(), iql, discriminator: Trained::new(net) })
+        let shape = Discriminator { config: config.clone(), net: Trained::new(net) };
+        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape })
     }
 }
 
@@ -119,33 +121,24 @@ pub fn reward_shift(logits: Tensor<3>, config: &SrpoConfig) -> Tensor<3> {
     log * config.lambda
 }
 
-impl Learner for Srpo {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, iql, discriminator } = self;
+impl Shape for Discriminator {
+    fn shape(&mut self, iql: &Iql, batch: &Minibatch, _step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+        let Self { config: c, net } = self;
         let labels = high_value_labels(iql.values(batch.s.clone()), c.share);
-        let loss = binary_cross_entropy(discriminator.net().forward(batch.s.clone()), labels);
+        let loss = binary_cross_entropy(net.net().forward(batch.s.clone()), labels);
         meter.record("discriminator_loss", &loss);
-        discriminator.step(loss.sum(), c.lr);
-        let shift = reward_shift(discriminator.net().valid().forward(batch.s.clone()), c);
+        net.step(loss.sum(), c.lr);
+        let shift = reward_shift(net.net().valid().forward(batch.s.clone()), c);
         meter.record("reward_shift", &shift);
-        iql.step(&Minibatch { r: batch.r.clone() + shift, ..batch.clone() }, None, step, meter);
+        (Minibatch { r: batch.r.clone() + shift, ..batch.clone() }, None)
     }
 
-    fn state(&self) -> NamedParameters {
-        let mut state = self.iql.state();
-        self.discriminator.save("srpo", &mut state);
-        state
+    fn save(&self, state: &mut NamedParameters) {
+        self.net.save("srpo", state);
     }
 
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.iql.restore(state, path)?;
-        self.discriminator.load("srpo", state, path)
-    }
-}
-
-impl PolicyLearner for Srpo {
-    fn policies(&self) -> Vec<Policy> {
-        self.iql.policies()
+    fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.net.load("srpo", state, path)
     }
 }
 

@@ -17,19 +17,16 @@
 //! | - | `hidden` | 256, 256 ReLU | the same |
 //! | - | `actor` | 256-256, 3e-4, constant | the same |
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
-use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
+use tce_nn::{Device, MlpConfig, Tensor};
 
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
-use crate::critic::Twins;
-use crate::deterministic::{DelayConfig, DelayedActor};
+use crate::critic::state_action;
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
-use crate::policy::Policy;
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::Meter;
 
 /// The configuration of [`Td3Bc`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -76,11 +73,7 @@ impl Td3BcConfig {
 }
 
 /// TD3+BC of a population.
-pub struct Td3Bc {
-    config: Td3BcConfig,
-    actor: DelayedActor,
-    critics: Twins,
-}
+pub type Td3Bc = Deterministic<Td3BcConfig>;
 
 impl Td3Bc {
     /// New networks for the members of `buffer`, to be trained for `steps` steps.
@@ -89,12 +82,9 @@ impl Td3Bc {
     /// If the configuration cannot be used.
     pub fn new(buffer: &Buffer, config: &Td3BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
         config.check()?;
-        let (inputs, train) = (buffer.inputs().len(), device.clone().autodiff());
-        Ok(Self {
-            actor: DelayedActor::new(buffer, &config.actor, &config.delay, steps, device)?,
-            critics: Twins::new(inputs, buffer.act_dim(), &config.hidden, &buffer.streams(), &train),
-            config: config.clone(),
-        })
+        let critic = MlpConfig::relu(buffer.inputs().len() + buffer.act_dim(), &config.hidden, 1);
+        let nets = ActorCritic::new(buffer, &config.actor, &config.delay, &critic, steps, device)?;
+        Ok(Deterministic { nets, rule: config.clone() })
     }
 }
 
@@ -104,42 +94,24 @@ pub fn normalised_value(q: Tensor<3>) -> Tensor<3> {
     member_mean(q) / Tensor::from_inner(scale)
 }
 
-impl Learner for Td3Bc {
-    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, actor, critics } = self;
-        let join = |s: &Tensor<3>, a: Tensor<3>| Tensor::cat(vec![s.clone(), a], 2);
-        let q = critics.lesser_target(join(&batch.s2, actor.next_action(batch.s2.clone(), step)));
-        let y = batch.r.clone() + batch.not_done.clone() * q * c.discount;
-        let loss = critics.step(join(&batch.s, batch.a.clone()), y, None, c.critic_lr, actor.polyak(step));
+impl Rule for Td3BcConfig {
+    fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let q = nets.next_value(batch.s2.clone(), nets.next_action(batch.s2.clone(), step));
+        let y = batch.r.clone() + batch.not_done.clone() * q * self.discount;
+        let sa = state_action(&batch.s, batch.a.clone());
+        let polyak = nets.polyak(step);
+        let loss = nets.critics.step(sa, y, None, self.critic_lr, polyak);
         meter.record("critic_loss", &loss);
-        if actor.due(step) {
-            let output = actor.forward(batch.s.clone());
-            let q = critics.pair[0].frozen(join(&batch.s, output.mean.clone()));
+        if nets.due(step) {
+            let output = nets.forward(batch.s.clone());
+            let q = nets.critics.pair[0].frozen(state_action(&batch.s, output.mean.clone()));
             let cloning = Actor::squared_loss(&output, batch.a.clone());
             meter.record("policy_value", &q);
             meter.record("cloning_loss", &cloning);
-            let loss = cloning - normalised_value(q) * c.alpha;
+            let loss = cloning - normalised_value(q) * self.alpha;
             drop(output);
-            actor.step(loss, step);
+            nets.step(loss, step);
         }
-    }
-
-    fn state(&self) -> NamedParameters {
-        let mut state = NamedParameters::default();
-        self.actor.save(&mut state);
-        self.critics.save(&mut state);
-        state
-    }
-
-    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.actor.load(state, path)?;
-        self.critics.load(state, path)
-    }
-}
-
-impl PolicyLearner for Td3Bc {
-    fn policies(&self) -> Vec<Policy> {
-        self.actor.policies()
     }
 }
 

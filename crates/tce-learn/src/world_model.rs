@@ -249,7 +249,7 @@ pub fn strip(segments: &Segments, batch: usize, device: &Device) -> [Tensor<3>; 
 
 /// Whose rows are meant, and where they are computed with.
 #[derive(Clone, Copy)]
-pub(crate) struct Place<'a> {
+pub(crate) struct Of<'a> {
     pub buffer: &'a Buffer,
     pub member: usize,
     pub device: &'a Device,
@@ -290,7 +290,7 @@ impl Contexts {
         steps: usize,
         encoder: &ContextEncoder,
         trajectories: &Trajectories,
-        Place { buffer, member, device }: Place,
+        Of { buffer, member, device }: Of,
     ) -> Vec<f32> {
         let rows = |(pick, valid): (&Pick, &[f32])| {
             let length = valid.iter().filter(|v| **v > 0.0).count();

@@ -1,8 +1,11 @@
 //! Learners end to end on small problems with known answers.
 
+mod common;
+
 use std::path::Path;
 use std::sync::Arc;
 
+use common::go;
 use rand::RngExt;
 use tce_base::Streams;
 use tce_data::{Standardizer, Transitions};
@@ -12,7 +15,7 @@ use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
     ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Mode, Place, Policy, PolicyLearner,
-    Steps, best_trajectories, train, train_labels,
+    best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -24,13 +27,7 @@ fn member(seed: u64, data: &Arc<Transitions>, standardised: bool) -> Member {
 }
 
 fn run<L: Learner>(learner: &mut L, buffer: &Buffer, steps: u64) -> tce_learn::Report {
-    let mut last = None;
-    train(learner, buffer, Steps::new(steps, 0), "test", &mut Checkpoints::none(), &cpu(), |report, _| {
-        last = Some(report.clone());
-        Ok::<_, LearnError>(())
-    })
-    .unwrap();
-    last.unwrap()
+    go(learner, buffer, 0, steps)
 }
 
 fn action(policy: &Policy, observation: &[f32]) -> Vec<f32> {
@@ -108,18 +105,14 @@ fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 32).unwrap();
     let config = IqlConfig { policy_extraction: PolicyExtraction::AwrLogprob, ..IqlConfig::default() };
     let new = || Iql::new(&buffer, &config, Regulariser::None, 20, &cpu()).unwrap();
-    let go = |iql: &mut Iql, from, to| {
-        let steps = Steps { from, to, report_every: 0 };
-        train(iql, &buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |_, _| Ok::<_, LearnError>(())).unwrap();
-    };
     let mut whole = new();
-    go(&mut whole, 0, 20);
+    go(&mut whole, &buffer, 0, 20);
     let mut first = new();
-    go(&mut first, 0, 11);
+    go(&mut first, &buffer, 0, 11);
     let state = tce_nn::NamedParameters::from_bytes(&first.state().to_bytes(), Path::new("state")).unwrap();
     let mut second = new();
     second.restore(&state, Path::new("state")).unwrap();
-    go(&mut second, 11, 20);
+    go(&mut second, &buffer, 11, 20);
     assert_eq!(whole.state(), second.state());
     let error = new().restore(&whole.policies()[0].to_parameters(), Path::new("other.safetensors")).unwrap_err();
     assert!(error.to_string().contains("other.safetensors"), "{error}");
@@ -281,17 +274,13 @@ fn dmc_is_iql_on_the_kept_rows_with_their_weights() {
 fn dmc_goes_on_from_its_state_and_refuses_rows_without_scores() {
     let buffer = Buffer::new(vec![scored_member(1)], 32).unwrap();
     let new = || new_dmc(&buffer, &DmcConfig::default(), 20).unwrap();
-    let go = |dmc: &mut Dmc, from, to| {
-        let steps = Steps { from, to, report_every: 0 };
-        train(dmc, &buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |_, _| Ok::<_, LearnError>(())).unwrap();
-    };
     let mut whole = new();
-    go(&mut whole, 0, 20);
+    go(&mut whole, &buffer, 0, 20);
     let mut first = new();
-    go(&mut first, 0, 11);
+    go(&mut first, &buffer, 0, 11);
     let mut second = new();
     second.restore(&first.state(), Path::new("state")).unwrap();
-    go(&mut second, 11, 20);
+    go(&mut second, &buffer, 11, 20);
     assert_eq!(whole.state(), second.state());
 
     let error = |member: Member| {

@@ -1,16 +1,17 @@
 //! Meta-DT end to end on small problems, and what must hold of it whatever it learns.
 
+mod common;
+
 use std::path::Path;
 use std::sync::Arc;
 
+use common::go;
 use rand::RngExt;
 use tce_base::{Streams, random::fill_normal};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::world_model::WorldModelConfig;
-use tce_learn::{
-    Buffer, LearnError, Learner, Member, MetaDt, MetaDtConfig, Meter, Policy, PolicyLearner, Steps, train,
-};
-use tce_nn::{Checkpoints, NamedParameters, cpu};
+use tce_learn::{Buffer, Learner, Member, MetaDt, MetaDtConfig, Meter, Policy, PolicyLearner};
+use tce_nn::{NamedParameters, cpu};
 
 /// A corridor: s = position, a moves it by a/5, the reward is the new position. An episode goes all the way left or all the
 /// way right, and by no more than its return can one tell beforehand which.
@@ -60,17 +61,6 @@ fn small(world_steps: u64) -> MetaDtConfig {
         },
         ..MetaDtConfig::default()
     }
-}
-
-fn go(learner: &mut MetaDt, buffer: &Buffer, from: u64, to: u64) -> tce_learn::Report {
-    let mut last = None;
-    let steps = Steps { from, to, report_every: 0 };
-    train(learner, buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |report, _| {
-        last = Some(report.clone());
-        Ok::<_, LearnError>(())
-    })
-    .unwrap();
-    last.unwrap()
 }
 
 /// Return of an episode from 0.

@@ -1,19 +1,22 @@
 //! The rivals and the deterministic actor-critics, end to end on a corridor.
 
+mod common;
+
 use std::path::Path;
 use std::sync::Arc;
 
+use common::go;
 use rand::RngExt;
 use tce_base::Streams;
 use tce_data::{Standardizer, Transitions};
 use tce_learn::cvae::CvaeConfig;
 use tce_learn::deterministic::DelayConfig;
 use tce_learn::{
-    ActorConfig, Bosa, BosaConfig, Buffer, Dara, DaraConfig, Igdf, IgdfConfig, IqlConfig, LearnError, Member, Mode,
-    Otdf, OtdfConfig, Place, Policy, PolicyLearner, Rebrac, RebracConfig, Regulariser, RegulariserConfig,
-    RegulariserKind, Srpo, SrpoConfig, Steps, Td3Bc, Td3BcConfig, train,
+    ActorConfig, Bosa, BosaConfig, Buffer, Dara, DaraConfig, Igdf, IgdfConfig, IqlConfig, Member, Mode, Otdf,
+    OtdfConfig, Place, Policy, PolicyLearner, Rebrac, RebracConfig, Regulariser, RegulariserConfig, RegulariserKind,
+    Srpo, SrpoConfig, Td3Bc, Td3BcConfig,
 };
-use tce_nn::{Checkpoints, NamedParameters, cpu};
+use tce_nn::{NamedParameters, cpu};
 
 /// s = position in [-1, 1], a moves it by a/5 (`against`: by -a/5), the reward is the new position. The behaviour goes left and
 /// right at random: the mean action is 0, the good one +1.
@@ -127,17 +130,6 @@ fn method(name: &str, mode: Mode, buffer: &Buffer, steps: u64) -> Box<dyn Policy
         }
         other => panic!("no method {other}"),
     }
-}
-
-fn go(learner: &mut dyn PolicyLearner, buffer: &Buffer, from: u64, to: u64) -> tce_learn::Report {
-    let mut last = None;
-    let steps = Steps { from, to, report_every: 0 };
-    train(learner, buffer, steps, "test", &mut Checkpoints::none(), &cpu(), |report, _| {
-        last = Some(report.clone());
-        Ok::<_, LearnError>(())
-    })
-    .unwrap();
-    last.unwrap()
 }
 
 /// Mean reward of 20 steps in the target's corridor; 0 for actions at random, .6 and more for going right.

@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 use tce_base::Streams;
-use tce_data::Shift;
+use tce_data::{Shift, Task};
 
 use crate::error::{ReportError, Result};
 use crate::folder::Verdict;
 use crate::paper::{self, PaperTable, Printed};
 use crate::stats::{Bootstrap, Draw, Estimate, Scores, permutation_p, probability_of_improvement};
-use crate::study::{Method, Run, Study, Task};
+use crate::study::{Method, Run, Study, order};
 
 /// A diverged policy counts as much as a random one. Left out, it would flatter its method.
 pub const DIVERGED: f64 = 0.0;
@@ -302,7 +302,7 @@ fn tasks_of(study: &Study) -> Vec<Task> {
             tasks.push(task);
         }
     }
-    tasks.sort_by_key(Task::order);
+    tasks.sort_by_key(order);
     tasks
 }
 

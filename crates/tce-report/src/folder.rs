@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use tce_base::{read_if_there, sha256_file, sha256_hex};
+use tce_base::{first_damaged, read_if_there, sha256_hex};
 
 use crate::error::{ReportError, Result};
 
@@ -181,14 +181,7 @@ impl RunFolder {
 
     /// The first file that is not what `done.json` says it was.
     pub fn damage(&self) -> Option<String> {
-        self.files.iter().find_map(|(name, expected)| {
-            let file = self.directory.join(name);
-            match sha256_file(&file) {
-                Ok(found) if found == *expected => None,
-                Ok(found) => Some(format!("{}: SHA-256 {found}, expected {expected}", file.display())),
-                Err(e) => Some(e.to_string()),
-            }
-        })
+        first_damaged(&self.directory, &self.files)
     }
 }
 

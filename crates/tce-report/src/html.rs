@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
-use tce_data::{Agent, Shift};
+use tce_data::{Agent, Shift, Task};
 
 use crate::analysis::{Aggregate, Analysis, Cell, Comparison, Finding, ShiftTable, Total, score};
 use crate::folder::Verdict;
 use crate::paper;
 use crate::stats::Estimate;
-use crate::study::{Cost, Run, Study, Task, agent_title, shift_title};
+use crate::study::{Cost, Run, Study, agent_title, order, shift_title, short};
 use crate::svg::{self, Axis, Frame, Interval, Line, Point, Series, minus};
 
 /// Points of a curve; more would be finer than the pixels.
@@ -631,7 +631,7 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
                     @let y = if log { decades(heights) } else { Axis::around(heights, 4) };
                     figure {
                         figcaption {
-                            (task.short())
+                            (short(task))
                             @if several { br; span { (shift_title(task.shift)) } }
                         }
                         (svg::lines(&Frame {
@@ -767,7 +767,7 @@ fn cost(study: &Study) -> Markup {
 
 fn runs(study: &Study) -> Markup {
     let mut tasks: Vec<Task> = study.runs.iter().map(|r| r.task).collect();
-    tasks.sort_by_key(Task::order);
+    tasks.sort_by_key(order);
     tasks.dedup();
     let mut configs: BTreeMap<&str, (&str, BTreeSet<&str>)> = BTreeMap::new();
     for run in &study.runs {

@@ -17,7 +17,7 @@ pub mod text;
 pub use analysis::{Analysis, Options, analyse};
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use study::{Cost, Method, Missing, Run, Study, Task};
+pub use study::{Cost, Method, Missing, Run, Study};
 
 use std::path::{Path, PathBuf};
 

@@ -3,9 +3,7 @@
 use std::sync::LazyLock;
 
 use serde::Serialize;
-use tce_data::{Agent, Quality, Shift};
-
-use crate::study::Task;
+use tce_data::{Agent, Quality, Shift, Task};
 
 /// A mean and the standard deviation over five seeds, as printed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

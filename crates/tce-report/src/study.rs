@@ -1,50 +1,22 @@
 //! What a report is about: methods, their runs, and what is missing.
 
-use std::fmt;
 use std::sync::Arc;
 
 use serde::Serialize;
-use tce_data::{Agent, Quality, Shift};
+use tce_data::{Agent, Quality, Shift, Task};
 
 use crate::folder::{Member, RunFolder};
 
-/// A transfer problem.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct Task {
-    /// The robot.
-    pub agent: Agent,
-    /// What the target domain changes.
-    pub shift: Shift,
-    /// Quality of the source data.
-    pub source: Quality,
-    /// Quality of the target data.
-    pub target: Quality,
+/// The paper's order: shifts, agents, source and target qualities.
+pub fn order(task: &Task) -> (usize, usize, Quality, Quality) {
+    let place = |k: Option<usize>| k.unwrap_or(usize::MAX);
+    let shift = place(Shift::ALL.iter().position(|s| *s == task.shift));
+    (shift, place(Agent::ALL.iter().position(|a| *a == task.agent)), task.source, task.target)
 }
 
-impl Task {
-    /// The paper's order: shifts, agents, source and target qualities.
-    pub fn order(&self) -> (usize, usize, Quality, Quality) {
-        let place = |k: Option<usize>| k.unwrap_or(usize::MAX);
-        let shift = place(Shift::ALL.iter().position(|s| *s == self.shift));
-        (shift, place(Agent::ALL.iter().position(|a| *a == self.agent)), self.source, self.target)
-    }
-
-    /// As in a table of one shift: `Hopper, medium → expert`.
-    pub fn short(&self) -> String {
-        format!("{}, {} → {}", agent_title(self.agent), self.source, self.target)
-    }
-}
-
-impl fmt::Display for Task {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(&format!("{}-{}:{}->{}", self.agent, self.shift, self.source, self.target))
-    }
-}
-
-impl Serialize for Task {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
+/// As in a table of one shift: `Hopper, medium → expert`.
+pub fn short(task: &Task) -> String {
+    format!("{}, {} → {}", agent_title(task.agent), task.source, task.target)
 }
 
 /// The agent's name in print.

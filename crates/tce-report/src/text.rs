@@ -3,7 +3,7 @@
 use crate::analysis::{Analysis, Cell, ShiftTable};
 use crate::html::headline;
 use crate::stats::Estimate;
-use crate::study::{Study, shift_title};
+use crate::study::{Study, shift_title, short};
 
 /// A table: a header, and rows of as many cells. The first column is text.
 struct Table {
@@ -42,7 +42,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Table {
         .map(|r| {
             let ours = r.cells.iter().map(|c| cell(c.as_ref()));
             let papers = r.paper.iter().map(|p| p.map_or("–".into(), |p| format!("{:.1} ± {:.1}", p.mean, p.std)));
-            std::iter::once(r.task.short()).chain(ours).chain(papers).collect()
+            std::iter::once(short(&r.task)).chain(ours).chain(papers).collect()
         })
         .collect();
     let of = |n: usize| if n < t.rows.len() { format!(" (of {n} tasks)") } else { String::new() };

@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use serde_json::{Value, json};
 use tce_base::sha256_hex;
-use tce_data::{Agent, Quality, Shift};
-use tce_report::{Analysis, Cost, Method, Missing, Options, Run, RunFolder, Study, Task, analyse};
+use tce_data::{Agent, Quality, Shift, Task};
+use tce_report::{Analysis, Cost, Method, Missing, Options, Run, RunFolder, Study, analyse};
 
 const HOSTILE: &str = "<script>alert(1)</script>\"'&{}|%_$\\";
 

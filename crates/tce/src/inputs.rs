@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use tce_base::sha256_file;
 use tce_data::{
-    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Transitions, ensure_same_agent,
+    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions, ensure_same_agent,
     infer_agents, load, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
@@ -13,7 +13,6 @@ use tce_sim::EPISODE_LIMIT;
 use crate::actors::{Cast, Recipe};
 use crate::error::{Error, Result};
 use crate::stand_ins::{self, shared_folder};
-use crate::task::Task;
 use crate::zoo;
 
 /// The files of a benchmark task, and where results go.

@@ -57,8 +57,7 @@ struct RowUnits {
 impl RowUnits {
     /// The units in which the rows of `tables` together have mean 0 and variance 1.
     fn fit(tables: &[&Transitions], target: Target) -> Self {
-        let columns: Vec<_> = tables.iter().map(|t| (tail(t, target), flags(t))).collect();
-        let row = |(t, (s2, flag)): (&&Transitions, &(Vec<f32>, Vec<f32>))| {
+        let columns = |t: &&Transitions| {
             let width = t.obs_dim + t.act_dim + 1;
             let mut head = Vec::with_capacity(t.len() * width);
             for i in 0..t.len() {
@@ -66,9 +65,9 @@ impl RowUnits {
                 head.extend_from_slice(t.action(i));
                 head.push(t.rewards[i]);
             }
-            (head, width, s2.clone(), flag.clone(), t.obs_dim)
+            (head, width, tail(t, target), flags(t), t.obs_dim)
         };
-        let parts: Vec<_> = tables.iter().zip(&columns).map(row).collect();
+        let parts: Vec<_> = tables.iter().map(columns).collect();
         let rows: Vec<_> =
             parts.iter().map(|(head, w, s2, flag, d)| Rows::join(&[(head, *w), (s2, *d), (flag, 1)])).collect();
         let mut all = Standardizer::fit_on(&rows);
@@ -159,10 +158,15 @@ impl ScoreUnits {
     }
 }
 
-/// A score for each of `uniform` ∈ [0, 1): at or above the quantile `from` of `scores`.
-fn draw_scores(scores: &[&[f32]], from: f64, draw: ScoreDraw, uniform: &[f32]) -> Vec<f32> {
+/// All `scores`, ascending.
+fn ascending(scores: &[&[f32]]) -> Vec<f32> {
     let mut all = scores.concat();
     all.sort_by(f32::total_cmp);
+    all
+}
+
+/// A score for each of `uniform` ∈ [0, 1): at or above the quantile `from` of `all` scores, ascending.
+fn draw_scores(all: &[f32], from: f64, draw: ScoreDraw, uniform: &[f32]) -> Vec<f32> {
     // As numpy interpolates percentiles.
     let quantile = |q: f64| {
         let at = q * (all.len() - 1) as f64;
@@ -346,8 +350,8 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     let units = &trained.units;
     // Per member, under which scores its rows are drawn.
     let under = scored.as_ref().map(|s| -> Vec<Vec<f32>> {
-        let scores = [s.source.as_slice(), s.target.as_slice()];
-        let draw = |u: Vec<f32>| draw_scores(&scores, j.guidance.from, j.guidance.draw, &u);
+        let all = ascending(&[&s.source, &s.target]);
+        let draw = |u: Vec<f32>| draw_scores(&all, j.guidance.from, j.guidance.draw, &u);
         members.iter().map(|m| draw(uniform_labels(m, "joint", j.rows, 1.0))).collect()
     });
     let condition = match (&under, &trained.scores) {
@@ -478,7 +482,7 @@ mod tests {
     fn rows_are_drawn_under_the_best_scores() {
         let few: Vec<f32> = (0..100).map(|i| i as f32 / 1e4).chain([1.0]).collect();
         let uniform: Vec<f32> = (0..1000).map(|i| i as f32 / 1e3).collect();
-        let draw = |by| draw_scores(&[&few[..50], &few[50..]], 0.9, by, &uniform);
+        let draw = |by| draw_scores(&ascending(&[&few[50..], &few[..50]]), 0.9, by, &uniform);
         let (ranks, values) = (draw(ScoreDraw::Ranks), draw(ScoreDraw::Values));
         assert!((ranks[0] - 0.009).abs() < 1e-6 && (values[0] - 0.009).abs() < 1e-6);
         let above = |x: &[f32]| x.iter().filter(|x| **x > 0.01).count();

@@ -8,12 +8,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_data::{Agent, Quality, Shift};
+use tce_data::{Agent, Quality, Shift, Task};
 use toml::{Table, Value};
 
 use crate::config::{Algorithm, Config};
 use crate::error::{Error, Result};
-use crate::task::Task;
 use crate::variant::Variant;
 
 const DEFAULT: &str = include_str!("../presets/default.toml");

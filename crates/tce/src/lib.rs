@@ -25,7 +25,6 @@ mod stage;
 mod stand_ins;
 mod study;
 mod sweep;
-mod task;
 mod units;
 mod variant;
 mod zoo;

@@ -35,11 +35,10 @@ pub struct Extra {
     pub scores: Option<Arc<Vec<f32>>>,
 }
 
-impl Extra {
-    fn select(&self, indices: &[usize]) -> Self {
-        let scores = self.scores.as_ref().map(|s| Arc::new(indices.iter().map(|&i| s[i]).collect()));
-        Self { rows: Arc::new(self.rows.select(indices)), scores }
-    }
+/// The rows at `indices`, with their numbers.
+fn select(rows: &Transitions, scores: Option<&Vec<f32>>, indices: &[usize]) -> Extra {
+    let scores = scores.map(|s| Arc::new(indices.iter().map(|&i| s[i]).collect()));
+    Extra { rows: Arc::new(rows.select(indices)), scores }
 }
 
 impl From<Arc<Transitions>> for Extra {
@@ -79,8 +78,8 @@ pub fn extra_rows(
         SourceRows::Nearest | SourceRows::Transport => {
             let source = inputs.source_rows()?;
             let indices = lambda_quantile_select(&distances(inputs, mixture.source, root)?, mixture.lambda);
-            let all = Extra { rows: Arc::new(source.clone()), scores: source_scores };
-            Some(vec![all.select(&indices); seeds.len()])
+            let selected = select(source, source_scores.as_deref(), &indices);
+            Some(vec![selected; seeds.len()])
         }
     };
     Ok(match (generated, selected) {
@@ -113,7 +112,7 @@ fn subset(rows: &Extra, n: usize, streams: Streams, name: &str) -> Extra {
     }
     let mut indices = rand::seq::index::sample(&mut streams.stream(name), rows.rows.len(), n).into_vec();
     indices.sort_unstable();
-    rows.select(&indices)
+    select(&rows.rows, rows.scores.as_deref(), &indices)
 }
 
 #[derive(Serialize)]

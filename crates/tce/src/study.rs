@@ -8,13 +8,13 @@ use std::sync::Arc;
 use clap::ValueEnum;
 use serde_json::Value;
 use tce_base::FileError;
+use tce_data::{Task, parse_agent};
 use tce_report::folder::Verdict;
 use tce_report::{Cost, Method, Missing, ReportError, Run, RunFolder, Study};
 
 use crate::error::{Error, Result};
 use crate::sweep::gather::Checked;
 use crate::sweep::{Entry, Kind, Sweep};
-use crate::task::{Task, parse_agent};
 use crate::variant::Variant;
 
 /// Everything that `directory` holds for a report.
@@ -23,11 +23,6 @@ use crate::variant::Variant;
 /// If there is neither a sweep nor a run, or a file of one is damaged.
 pub fn of_directory(directory: &Path) -> Result<Study> {
     if directory.join("manifest.jsonl").exists() { of_sweep(&Sweep::open(directory)?) } else { of_runs(directory) }
-}
-
-fn task(task: Task) -> tce_report::Task {
-    let Task { agent, shift, source, target } = task;
-    tce_report::Task { agent, shift, source, target }
 }
 
 fn method(variant: Variant, label: &str) -> Method {
@@ -72,12 +67,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     };
     for entry in runs() {
         let mut missing = |why: String| {
-            study.missing.push(Missing {
-                task: task(entry.task),
-                method: entry.column(),
-                what: entry.to_string(),
-                why,
-            });
+            study.missing.push(Missing { task: entry.task, method: entry.column(), what: entry.to_string(), why });
         };
         match sweep.check(entry) {
             Checked::Missing => missing(match sweep.failure(entry) {
@@ -170,13 +160,7 @@ fn agree(sweep: &Sweep, entry: &Entry, recorded: Option<f64>, folder: &RunFolder
 fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder) {
     let folder = Arc::new(folder);
     for (index, member) in folder.members.iter().enumerate() {
-        runs.push(Run {
-            task: task(of),
-            method: method.to_owned(),
-            member: member.clone(),
-            index,
-            folder: folder.clone(),
-        });
+        runs.push(Run { task: of, method: method.to_owned(), member: member.clone(), index, folder: folder.clone() });
     }
 }
 
@@ -207,7 +191,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
             let Some((name, _)) = full.rsplit_once('-').filter(|_| run.join("spec.json").exists()) else { continue };
             let mut lost = |why: String| {
                 let what = format!("{name}, {of}, {}", run.display());
-                missing.push(Missing { task: task(of), method: name.to_owned(), what, why });
+                missing.push(Missing { task: of, method: name.to_owned(), what, why });
             };
             match RunFolder::read(&run)? {
                 None => lost("not finished: no done.json".into()),

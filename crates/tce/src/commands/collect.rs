@@ -4,14 +4,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, reference_scores, save_d4rl};
+use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, parse_environment, reference_scores, save_d4rl};
 use tce_sim::EPISODE_LIMIT;
 
 use crate::actors::{Part, Recipe};
 use crate::error::{Error, Result};
 use crate::inputs::d4rl_recipe;
 use crate::output::{Output, table};
-use crate::task::parse_environment;
 use crate::zoo;
 
 /// Arguments of `collect`.

@@ -2,11 +2,11 @@
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
+use tce_data::Task;
 
 use crate::error::Result;
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::task::Task;
 use crate::variant::Variant;
 
 /// Show the configuration.

@@ -7,13 +7,12 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_data::{
     Agent, Check, Inspection, LoadOptions, LoadReport, Loaded, ScoreTable, Severity, Shift, infer_agents, load,
-    reference_scores, save_d4rl,
+    parse_environment, reference_scores, save_d4rl,
 };
 use tce_sim::{EPISODE_LIMIT, ReplayReport, replay};
 
 use crate::error::{Error, Result};
 use crate::output::{Output, table};
-use crate::task::parse_environment;
 
 /// Look at, check and convert data sets.
 #[derive(Debug, Subcommand)]

@@ -3,7 +3,7 @@
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::Streams;
-use tce_data::Standardizer;
+use tce_data::{Standardizer, Task};
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
@@ -16,7 +16,6 @@ use crate::generator::Generator;
 use crate::inputs::{DataArgs, Inputs, Table};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::task::Task;
 
 /// Measure what a stage of the pipeline does.
 #[derive(Debug, Subcommand)]

@@ -5,12 +5,11 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 use tce_base::{Streams, interrupted};
-use tce_data::{Agent, ScoreTable, Shift};
+use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 
 use crate::actors::{Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::output::{Output, mean_std, table};
-use crate::task::parse_environment;
 
 /// Arguments of `evaluate`.
 #[derive(Debug, Args)]

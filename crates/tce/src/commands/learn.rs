@@ -6,7 +6,7 @@ use std::sync::Arc;
 use clap::Args;
 use serde::Serialize;
 use tce_base::{sha256_file, sha256_hex};
-use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load};
+use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, parse_environment};
 use tce_nn::cpu;
 
 use crate::actors::Arena;
@@ -17,7 +17,6 @@ use crate::learning::{Learned, MemberData, learn};
 use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
-use crate::task::parse_environment;
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]

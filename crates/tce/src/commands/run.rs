@@ -2,6 +2,7 @@
 
 use clap::Args;
 use serde::Serialize;
+use tce_data::Task;
 use tce_nn::cpu;
 
 use crate::config::Algorithm;
@@ -10,7 +11,6 @@ use crate::inputs::{Behaviour, DataArgs, Inputs};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
-use crate::task::Task;
 use crate::variant::Variant;
 
 /// Arguments of `run`.

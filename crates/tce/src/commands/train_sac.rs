@@ -5,14 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
-use tce_data::{Agent, Shift, save_d4rl};
+use tce_data::{Agent, Shift, parse_environment, save_d4rl};
 use tce_learn::sac::SacConfig;
 use tce_nn::cpu;
 
 use crate::acting::{Goal, Ledger, Settings, Training};
 use crate::error::{Error, Result};
 use crate::output::{Output, table};
-use crate::task::parse_environment;
 
 /// Steps of a training before the next one's turn.
 const TURN: u64 = 200;

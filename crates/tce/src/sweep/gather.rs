@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use serde::Serialize;
-use tce_base::sha256_file;
+use tce_base::first_damaged;
 
 use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
@@ -105,14 +105,7 @@ impl Sweep {
         if outcome.id != entry.id {
             return Some(format!("found the outcome of {}, expected that of {}", outcome.id, entry.id));
         }
-        outcome.files.iter().find_map(|(name, expected)| {
-            let file = self.directory.join(&outcome.place).join(name);
-            match sha256_file(&file) {
-                Ok(found) if found == *expected => None,
-                Ok(found) => Some(format!("{}: SHA-256 {found}, expected {expected}", file.display())),
-                Err(e) => Some(e.to_string()),
-            }
-        })
+        first_damaged(&self.directory.join(&outcome.place), &outcome.files)
     }
 }
 

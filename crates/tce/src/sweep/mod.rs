@@ -18,13 +18,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::{FileError, read_if_there, sha256_hex, write_atomically};
+use tce_data::Task;
 
 use crate::PROGRAM;
 use crate::config::{Config, GeneratedRows, SourceRows};
 use crate::error::{Error, Result};
 use crate::inputs::DataArgs;
 use crate::layers::{Layered, Preset};
-use crate::task::Task;
 use crate::variant::Variant;
 
 pub mod gather;

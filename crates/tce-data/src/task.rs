@@ -4,8 +4,8 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use crate::{Agent, Quality, Shift};
 use serde::{Deserialize, Serialize};
-use tce_data::{Agent, Quality, Shift};
 
 /// One transfer problem: an agent, how the target differs from the source, and the quality of both data sets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
