@@ -15,6 +15,7 @@
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
+//! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
 pub mod actor;
 pub mod bc;
@@ -50,6 +51,7 @@ pub mod srpo;
 pub mod td3_bc;
 mod training;
 pub mod transformer;
+pub mod transition_model;
 pub mod world_model;
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
@@ -77,3 +79,4 @@ pub use training::{
     Lane, Learner, Meter, Outcome, Place, PolicyLearner, Report, Steps, member_noise, prepare, train,
     train_side_by_side,
 };
+pub use transition_model::{Densities, TransitionConfig, TransitionModel, train_transition_models};
