@@ -30,6 +30,12 @@ impl Streams {
         self.seed
     }
 
+    /// Streams of their own for a piece of work that must not draw what another one of this seed draws.
+    pub fn child(&self, name: &str) -> Self {
+        use rand::Rng as _;
+        Self::new(self.stream(name).next_u64())
+    }
+
     /// Stream 0 of `name`.
     pub fn stream(&self, name: &str) -> Rng {
         self.indexed(name, 0)

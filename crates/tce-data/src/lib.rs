@@ -37,7 +37,7 @@ pub use check::{Check, Finding, Severity, check};
 pub use density::{DensityOptions, DensityScale, DensityScores, density_scores, further_scores};
 pub use error::{DataError, Problem};
 pub use files::{Dropped, Layout, LoadOptions, LoadReport, Loaded, Successors, load, read_attributes, save_d4rl};
-pub use filter::zscore_keep;
+pub use filter::{largest_z, zscore_keep};
 pub use inspect::{DimensionSummary, Inspection, Summary, inspect};
 pub use neighbours::{NeighbourOptions, Units, lambda_quantile_select, nn_distances};
 pub use quality::Quality;

@@ -1,0 +1,26 @@
+//! What can be measured of generated and source rows, beside the target's: the paper's analyses (Fig. 1a, Fig. 3, Appendix F),
+//! Theorem 1, and a λ chosen by it. Nothing here knows networks: their predictions come in as numbers.
+//!
+//! | question | file |
+//! |---|---|
+//! | Which states do generated rows reach? (Fig. 3 a.2) | [`coverage`] |
+//! | What does it look like? (Fig. 1a, Fig. 3 a.1) | [`embedding`] |
+//! | Are generated rows copies of training rows? | [`memorisation`] |
+//! | How far are two transition models apart? (Fig. 3 b.2) | [`gaussian`] |
+//! | What does Theorem 1 say, and which λ does it choose? | [`bounds`] |
+//! | Everything about one run | [`Diagnosis`] |
+
+pub mod bounds;
+pub mod coverage;
+mod diagnosis;
+pub mod embedding;
+pub mod gaussian;
+pub mod memorisation;
+mod numbers;
+
+pub use bounds::{Bounds, Choice, Curve};
+pub use coverage::Coverage;
+pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};
+pub use embedding::{Embedding, Group};
+pub use memorisation::Memorisation;
+pub use numbers::{Histogram, Spread};
