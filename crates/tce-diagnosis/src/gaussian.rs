@@ -17,8 +17,11 @@ pub struct Normals<'a> {
     pub dim: usize,
 }
 
+/// μ and ln σ of one distribution.
+type Row<'a> = (&'a [f32], &'a [f32]);
+
 impl<'a> Normals<'a> {
-    fn rows(self) -> impl IndexedParallelIterator<Item = (&'a [f32], &'a [f32])> {
+    fn rows(self) -> impl IndexedParallelIterator<Item = Row<'a>> {
         assert_eq!(self.mean.len(), self.log_std.len(), "one spread per mean");
         self.mean.par_chunks_exact(self.dim).zip(self.log_std.par_chunks_exact(self.dim))
     }
@@ -26,7 +29,7 @@ impl<'a> Normals<'a> {
 
 /// KL(P‖Q) of every row, in nats:  Σ_d ln(σ_q/σ_p) + (σ_p² + (μ_p − μ_q)²) / 2σ_q² − ½.
 pub fn kl(p: Normals<'_>, q: Normals<'_>) -> Vec<f64> {
-    let row = |((mp, lp), (mq, lq)): ((&[f32], &[f32]), (&[f32], &[f32]))| -> f64 {
+    let row = |((mp, lp), (mq, lq)): (Row, Row)| -> f64 {
         let term = |d: usize| {
             let (lp, lq, shift) = (f64::from(lp[d]), f64::from(lq[d]), f64::from(mp[d]) - f64::from(mq[d]));
             lq - lp + ((2.0 * lp).exp() + shift * shift) * (-2.0 * lq).exp() / 2.0 - 0.5
@@ -42,7 +45,7 @@ pub fn total_variation(p: Normals<'_>, q: Normals<'_>, streams: &Streams) -> Vec
     let dim = p.dim;
     let mut z = vec![0.0f32; DRAWS * dim];
     fill_normal(&mut streams.stream("diagnosis/total variation"), &mut z);
-    let row = |((mp, lp), (mq, lq)): ((&[f32], &[f32]), (&[f32], &[f32]))| -> f64 {
+    let row = |((mp, lp), (mq, lq)): (Row, Row)| -> f64 {
         let draw = |z: &[f32]| {
             let log_ratio = |d: usize| {
                 let (z, lp, lq) = (f64::from(z[d]), f64::from(lp[d]), f64::from(lq[d]));

@@ -98,6 +98,11 @@ impl TransitionModel {
         Ok(Self { config: config.clone(), net: Trained::new(net), buffer, units, device: device.clone() })
     }
 
+    /// The dimensions of a density: those that the networks see.
+    pub fn dim(&self) -> usize {
+        self.buffer.inputs().len()
+    }
+
     /// (μ, ln σ), `[P, B, d]` each, of what the network gives.
     fn split(&self, output: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
         let d = output.dims()[2] / 2;

@@ -18,7 +18,7 @@ const CURVE_POINTS: usize = 60;
 /// The page's text.
 pub fn page(study: &Study, analysis: &Analysis) -> String {
     let title = format!("{} · tce report", study.name);
-    let sections = [
+    let mut sections = vec![
         ("findings", "Findings", findings(study, analysis)),
         ("scores", "Scores by task", tables(analysis)),
         ("statistics", "Statistics over tasks", statistics(analysis)),
@@ -27,6 +27,27 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
         ("runs", "Runs and provenance", runs(study)),
         ("methods", "How the figures are made", methods(analysis)),
     ];
+    if !study.diagnoses.is_empty() {
+        sections.insert(3, ("diagnoses", "Generated rows and λ", crate::diagnosis::section(study, analysis)));
+    }
+    let body = html! {
+        (head(study, analysis))
+        (warnings(analysis))
+        nav aria-label="Sections" {
+            @for (id, title, _) in &sections { a href=(format!("#{id}")) { (title) } }
+        }
+        @for (id, title, body) in &sections {
+            section id=(id) { h2 { (title) } (body) }
+        }
+        footer class="note" {
+            "Made by " (concat!("tce ", env!("CARGO_PKG_VERSION"))) " from " code { (study.directory) } "."
+        }
+    };
+    document(&title, body)
+}
+
+/// A whole page around `body`.
+pub(crate) fn document(title: &str, body: Markup) -> String {
     let markup = html! {
         (DOCTYPE)
         html lang="en" {
@@ -38,21 +59,7 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
                 title { (title) }
                 style { (PreEscaped(include_str!("page.css"))) }
             }
-            body {
-                main {
-                    (head(study, analysis))
-                    (warnings(analysis))
-                    nav aria-label="Sections" {
-                        @for (id, title, _) in &sections { a href=(format!("#{id}")) { (title) } }
-                    }
-                    @for (id, title, body) in &sections {
-                        section id=(id) { h2 { (title) } (body) }
-                    }
-                    footer class="note" {
-                        "Made by " (concat!("tce ", env!("CARGO_PKG_VERSION"))) " from " code { (study.directory) } "."
-                    }
-                }
-            }
+            body { main { (body) } }
         }
     };
     markup.into_string()
@@ -676,7 +683,7 @@ fn curves(study: &Study, analysis: &Analysis) -> Markup {
 }
 
 /// An axis of whole powers of ten.
-fn decades(exponents: impl Iterator<Item = f64>) -> Axis {
+pub(crate) fn decades(exponents: impl Iterator<Item = f64>) -> Axis {
     let (low, high) = exponents.fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
     let (low, high) = if low > high { (0.0, 1.0) } else { (low.floor(), high.ceil().max(low.floor() + 1.0)) };
     let step = ((high - low) / 5.0).ceil().max(1.0);

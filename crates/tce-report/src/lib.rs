@@ -1,10 +1,11 @@
 //! What many runs come to, and a page that says so: statistics over tasks and seeds, the tables of the paper beside ours, and
 //! the report as HTML, Markdown and LaTeX.
 //!
-//! [`study::Study`] holds what there is, [`analysis::analyse`] decides every figure and warning, and [`html`] and [`text`] only
+//! [`diagnosis`] shows what `tce diagnose` found. [`study::Study`] holds what there is, [`analysis::analyse`] decides every figure and warning, and [`html`] and [`text`] only
 //! print them.
 
 pub mod analysis;
+pub mod diagnosis;
 pub mod error;
 pub mod folder;
 pub mod html;
@@ -15,6 +16,7 @@ pub mod svg;
 pub mod text;
 
 pub use analysis::{Analysis, Options, analyse};
+pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
 pub use study::{Cost, Method, Missing, Run, Study};

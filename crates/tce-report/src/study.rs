@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 use tce_data::{Agent, Quality, Shift, Task};
+use tce_diagnosis::Diagnosis;
 
 use crate::folder::{Member, RunFolder};
 
@@ -119,4 +120,6 @@ pub struct Study {
     pub notes: Vec<String>,
     /// What the stages cost.
     pub costs: Vec<Cost>,
+    /// What `tce diagnose` found about its runs.
+    pub diagnoses: Vec<Diagnosis>,
 }

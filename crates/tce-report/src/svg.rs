@@ -202,6 +202,11 @@ pub struct Frame<'a> {
 
 /// Lines with bands. A line of one point is a dot.
 pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
+    marked_lines(frame, lines, None)
+}
+
+/// [`lines`] with a place on the horizontal axis to compare with.
+fn marked_lines(frame: &Frame<'_>, lines: &[Line], mark: Option<f64>) -> Markup {
     let (width, height) = frame.size;
     let (left, right, top, bottom) = (44.0, width - 12.0, 24.0, height - 40.0);
     let ((x_unit, x_axis), (y_unit, y_axis)) = (&frame.x, &frame.y);
@@ -227,6 +232,9 @@ pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
                 text class="tick" x=(n(x(*tick))) y=(n(bottom + 17.0)) text-anchor="middle" { (x_axis.label(*tick)) }
             }
             line class="axis" x1=(n(left)) x2=(n(right)) y1=(n(bottom)) y2=(n(bottom)) {}
+            @if let Some(mark) = mark {
+                line class="ref" x1=(n(x(mark))) x2=(n(x(mark))) y1=(n(top)) y2=(n(bottom)) {}
+            }
             text class="unit" x="2" y="12" { (y_unit) }
             text class="unit" x=(n((left + right) / 2.0)) y=(n(height - 6.0)) text-anchor="middle" { (x_unit) }
             @for line in lines {
@@ -246,6 +254,83 @@ pub fn lines(frame: &Frame<'_>, lines: &[Line]) -> Markup {
             }
         }
     }
+}
+
+/// Points of one group.
+#[derive(Clone, Debug)]
+pub struct Cloud {
+    /// What they are of.
+    pub series: Series,
+    /// Their places.
+    pub points: Vec<[f32; 2]>,
+}
+
+/// Clouds of points on one scale in both directions, without axes: only what lies near what has a meaning.
+pub fn clouds(label: &str, (width, height): (f64, f64), clouds: &[Cloud]) -> Markup {
+    let all = || clouds.iter().flat_map(|c| &c.points).filter(|p| p[0].is_finite() && p[1].is_finite());
+    let range =
+        |k: usize| all().fold((f64::MAX, f64::MIN), |(l, h), p| (l.min(f64::from(p[k])), h.max(f64::from(p[k]))));
+    let ((x0, x1), (y0, y1)) = (range(0), range(1));
+    let margin = 6.0;
+    let scale = ((width - 2.0 * margin) / (x1 - x0).max(1e-9)).min((height - 2.0 * margin) / (y1 - y0).max(1e-9));
+    let place = |p: &[f32; 2]| {
+        let x = width / 2.0 + (f64::from(p[0]) - (x0 + x1) / 2.0) * scale;
+        let y = height / 2.0 - (f64::from(p[1]) - (y0 + y1) / 2.0) * scale;
+        format!("M{} {}h0", n(x), n(y))
+    };
+    html! {
+        svg viewBox=(format!("0 0 {} {}", n(width), n(height))) role="img" aria-label=(label) class="fig" {
+            @for cloud in clouds {
+                // One path a group: a circle a point would take ten times the bytes.
+                path class=(format!("dots {}", cloud.series.class)) d=(cloud.points.iter().map(place).collect::<String>()) {
+                    title { (cloud.series.title) }
+                }
+            }
+        }
+    }
+}
+
+/// The sample of a cloud beside its name.
+pub fn dot_key(series: &Series) -> Markup {
+    html! {
+        span class="key" {
+            svg class=(format!("sample dot {}", series.class)) viewBox="0 0 10 10" aria-hidden="true" { path class="dots" d="M5 5h0" {} }
+            (series.title)
+        }
+    }
+}
+
+/// A histogram.
+#[derive(Clone, Debug)]
+pub struct Steps {
+    /// What it is of.
+    pub series: Series,
+    /// Where the first bin begins.
+    pub low: f64,
+    /// Where the last one ends.
+    pub high: f64,
+    /// By bin.
+    pub counts: Vec<u64>,
+}
+
+impl Steps {
+    /// The share of every bin.
+    pub fn shares(&self) -> Vec<f64> {
+        let all = self.counts.iter().sum::<u64>().max(1) as f64;
+        self.counts.iter().map(|c| *c as f64 / all).collect()
+    }
+}
+
+/// Histograms as outlines; `mark` is a place to compare with.
+pub fn steps(frame: &Frame<'_>, histograms: &[Steps], mark: Option<f64>) -> Markup {
+    let outline = |h: &Steps| {
+        let (shares, width) = (h.shares(), (h.high - h.low) / h.counts.len() as f64);
+        let edge = |k: usize| h.low + k as f64 * width;
+        let tops = (shares.iter().enumerate()).flat_map(|(k, y)| [(edge(k), *y), (edge(k + 1), *y)]);
+        let points = std::iter::once((h.low, 0.0)).chain(tops).chain([(h.high, 0.0)]);
+        Line { series: h.series.clone(), points: points.map(|(x, y)| Point { x, y, band: None }).collect() }
+    };
+    marked_lines(frame, &histograms.iter().map(outline).collect::<Vec<_>>(), mark)
 }
 
 /// A power of ten in print.

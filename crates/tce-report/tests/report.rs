@@ -77,6 +77,7 @@ fn study(root: &Path) -> Study {
         missing: Vec::new(),
         conflicts: Vec::new(),
         notes: Vec::new(),
+        diagnoses: Vec::new(),
         costs: vec![Cost {
             stage: "Score networks".into(),
             agent: Agent::Hopper,

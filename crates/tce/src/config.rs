@@ -17,6 +17,9 @@ use crate::error::{Error, Result};
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct Config {
+    /// Sweeps that were planned, and runs that were done, before there was this table have the whole target.
+    #[serde(default)]
+    pub target: TargetConfig,
     pub source: SourceConfig,
     pub generator: GeneratorConfig,
     pub filter: FilterConfig,
@@ -25,6 +28,14 @@ pub struct Config {
     pub mixture: MixtureConfig,
     pub learner: LearnerConfig,
     pub evaluation: EvaluationConfig,
+}
+
+/// How much of the target data is used.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct TargetConfig {
+    pub rows: usize,
 }
 
 /// Source data that a task does not bring along.

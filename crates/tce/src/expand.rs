@@ -104,7 +104,7 @@ impl<'a> Finisher<'a> {
     }
 
     /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite never do.
-    fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
+    pub(crate) fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
         let d = self.units.live.len();
         let finite = states
             .chunks_exact(d)
@@ -137,6 +137,11 @@ impl<'a> Finisher<'a> {
             }
             kept.push((s, s2));
         }
+        self.label(&kept)
+    }
+
+    /// Labels pairs of whole states, one pair of tables per member.
+    pub(crate) fn label(&self, pairs: &[(Vec<f32>, Vec<f32>)]) -> Result<Vec<Labelled>> {
         let rule = |agent: Agent| move |_: &[f32], s2: &[f32]| terminal_rule(agent, s2);
         let agent_rule = self.agent.map(rule);
         let terminals = match (self.terminal, &agent_rule) {
@@ -144,7 +149,7 @@ impl<'a> Finisher<'a> {
             (Terminal::Rule, Some(rule)) => TerminalHandling::Rule(rule),
             (Terminal::Rule | Terminal::Learned, _) => TerminalHandling::Learned,
         };
-        Ok(self.models.label(&kept, terminals)?)
+        Ok(self.models.label(pairs, terminals)?)
     }
 }
 

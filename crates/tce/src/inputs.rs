@@ -11,6 +11,7 @@ use tce_data::{
 use tce_sim::EPISODE_LIMIT;
 
 use crate::actors::{Cast, Recipe};
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::stand_ins::{self, shared_folder};
 use crate::zoo;
@@ -52,7 +53,7 @@ pub struct Table {
     pub rows: Transitions,
     /// The file.
     pub file: PathBuf,
-    /// SHA-256 of the file.
+    /// SHA-256 of the file, and how many of its rows these are, if not all.
     pub hash: String,
 }
 
@@ -122,6 +123,24 @@ impl Inputs {
         let target = table(&target_file(task, args)?, dims)?;
         let source = source_rows.map(|rows| table(&source_file(task, args, rows)?, dims)).transpose()?;
         Self { agent: Some(agent), shift: Some(shift), target, source }.checked()
+    }
+
+    /// [`Inputs::of_task`] as `config` wants them: without source rows if it has no use for them, with as many target rows as it says.
+    pub fn of_config(task: Task, args: &DataArgs, config: &Config) -> Result<Self> {
+        let rows = config.needs_source().then_some(config.source.rows);
+        Ok(Self::of_task(task, args, rows)?.with_target_rows(config.target.rows))
+    }
+
+    /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
+    pub fn with_target_rows(mut self, rows: usize) -> Self {
+        let target = &mut self.target;
+        if rows > 0 && rows < target.rows.len() {
+            target.rows = target.rows.select(&(0..rows).collect::<Vec<_>>());
+            let last = rows - 1;
+            target.rows.timeouts[last] = !target.rows.terminals[last];
+            target.hash = format!("{}, the first {rows} rows", target.hash);
+        }
+        self
     }
 
     fn checked(self) -> Result<Self> {

@@ -232,6 +232,11 @@ impl ConfigArgs {
         self
     }
 
+    /// Whether nothing was said.
+    pub fn is_empty(&self) -> bool {
+        self.preset == Preset::default() && self.config.is_none() && self.sets.is_empty()
+    }
+
     /// The layers for `task` and `variant`.
     pub fn layered(&self, task: Option<Task>, variant: Option<Variant>) -> Result<Layered> {
         Layered::new(self.preset, task, variant, self.config.as_deref(), &self.sets)

@@ -5,7 +5,7 @@ mod actors;
 mod bench;
 mod commands;
 mod config;
-mod diagnostics;
+mod diagnosis;
 mod error;
 mod expand;
 #[cfg(test)]

@@ -54,7 +54,7 @@ impl Augment {
     pub fn run(self, output: Output) -> Result<()> {
         super::refuse_existing(&self.out, self.force)?;
         let config = self.config.layered(None, None)?.config()?;
-        let inputs = Inputs::of_files(Some(&self.source), &self.target)?;
+        let inputs = Inputs::of_files(Some(&self.source), &self.target)?.with_target_rows(config.target.rows);
         let expansion = expand(&inputs, &config, &[self.seed], &self.cache, &cpu())?;
         let (generated, report) = (&expansion.tables[0], expansion.reports[0].clone());
         let target = &inputs.target.rows;

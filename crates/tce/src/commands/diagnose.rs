@@ -1,27 +1,90 @@
 //! `tce diagnose`.
 
+use std::path::{Path, PathBuf};
+
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use tce_base::Streams;
+use tce_base::{FileError, Streams, read_if_there, write_atomically};
 use tce_data::{Standardizer, Task};
+use tce_diagnosis::{AtBound, Diagnosis, Spread};
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
-use tce_learn::TerminalHandling;
+use tce_learn::{TerminalHandling, TransitionConfig};
 use tce_nn::cpu;
 
-use crate::diagnostics::{Consistency, Quality, consistency, hold_out, quality, step_std};
-use crate::error::Result;
+use crate::config::Config;
+use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
+use crate::diagnosis::{Options, Subject, diagnose};
+use crate::error::{Error, Result};
 use crate::expand::{Finisher, label_models};
 use crate::generator::Generator;
 use crate::inputs::{DataArgs, Inputs, Table};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
+use crate::study::task_of;
+use crate::variant::Variant;
 
-/// Measure what a stage of the pipeline does.
+/// Measure what a run's generator does: coverage, reliability, copies, label errors, Theorem 1 and the λ it chooses.
+///
+/// `tce diagnose RUN` takes the directory of a finished run with generated rows (tce-og, say); `tce diagnose --source old.hdf5 --target
+/// new.hdf5` takes two files of your own and needs no simulator.
+#[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
+pub struct Diagnose {
+    #[command(subcommand)]
+    part: Option<Part>,
+    #[command(flatten)]
+    run: RunArgs,
+}
+
+/// Parts of the pipeline.
 #[derive(Debug, Subcommand)]
-pub enum Diagnose {
+enum Part {
     /// The generator: every noise process with every sampler, against held-out rows and the simulator.
     Generator(GeneratorArgs),
+}
+
+/// What to diagnose.
+#[derive(Debug, Args)]
+struct RunArgs {
+    /// The run's directory, RUNS/TASK/METHOD-KEY as `tce run` prints it.
+    #[arg(value_name = "RUN", required_unless_present = "target")]
+    run: Option<PathBuf>,
+    /// Source data: of the run, where its own is not found; or your own.
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
+    /// Target data: of the run, where its own is not found; or your own.
+    #[arg(long, value_name = "FILE")]
+    target: Option<PathBuf>,
+    /// The run's data were collected with --from-zoo.
+    #[arg(long)]
+    from_zoo: bool,
+    /// Where stages are kept (default: the run's own folder, or runs).
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// The seed to look at (default: the run's first, or 0).
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Rows behind every figure.
+    #[arg(long, default_value_t = Options::default().rows)]
+    rows: usize,
+    /// Label bounds, separated by commas; 0 and the run's own are among them in any case.
+    #[arg(long, value_delimiter = ',', default_values_t = Options::default().y_max)]
+    y_max: Vec<f32>,
+    /// Use no simulator, as for a robot of your own.
+    #[arg(long)]
+    no_simulator: bool,
+    /// Updates of the transition models.
+    #[arg(long, default_value_t = Options::default().transition.steps)]
+    transition_steps: u64,
+    /// Updates of the value function.
+    #[arg(long, default_value_t = Options::default().value_steps)]
+    value_steps: u64,
+    /// Abundant target rows to simulate.
+    #[arg(long, default_value_t = Options::default().abundant)]
+    abundant: usize,
+    #[command(flatten)]
+    config: ConfigArgs,
 }
 
 /// Arguments of `generator`.
@@ -119,17 +182,224 @@ fn sampler_name(sampler: &Sampler) -> String {
 }
 
 impl Diagnose {
-    /// Runs the subcommand.
+    /// Runs the command.
     pub fn run(self, output: Output) -> Result<()> {
-        let Diagnose::Generator(args) = self;
-        args.run(output)
+        match self.part {
+            Some(Part::Generator(args)) => args.run(output),
+            None => self.run.run(output),
+        }
     }
+}
+
+/// A finished run, as its directory tells it.
+struct Finished {
+    config: Config,
+    seeds: Vec<u64>,
+    task: Task,
+    root: PathBuf,
+    target: String,
+    source: Option<String>,
+}
+
+impl Finished {
+    fn read(directory: &Path) -> Result<Self> {
+        let read = |name: &str| -> Result<String> {
+            let path = directory.join(name);
+            match read_if_there(&path)? {
+                Some(bytes) => Ok(String::from_utf8_lossy(&bytes).into_owned()),
+                None => Err(Error::missing(
+                    &path,
+                    "no such file; give the directory of a finished run, RUNS/TASK/METHOD-KEY as `tce run` prints it, or two files \
+                     of your own with --source and --target",
+                )),
+            }
+        };
+        let damaged = |name: &str, why: String| {
+            Error::Failed(format!("{}: {why}; is this a run of this version of tce?", directory.join(name).display()))
+        };
+        let (spec, config) = (read("spec.json")?, read("config.toml")?);
+        read("done.json")?;
+        let spec: serde_json::Value = serde_json::from_str(&spec).map_err(|e| damaged("spec.json", e.to_string()))?;
+        let (inputs, seeds) = (&spec["spec"]["inputs"], &spec["spec"]["seeds"]);
+        let seeds = serde_json::from_value(seeds.clone()).map_err(|e| damaged("spec.json", format!("seeds: {e}")))?;
+        let hash = |key: &str| inputs[key].as_str().map(str::to_owned);
+        let place = directory.canonicalize().map_err(|e| FileError::new(directory, "find", e))?;
+        let folder = place.parent();
+        let task = folder.and_then(task_of).ok_or_else(|| {
+            let found = folder.map_or_else(String::new, |f| f.display().to_string());
+            Error::Usage(format!(
+                "{}: found the run in {found}, expected a folder named after its task, as hopper-morph_medium-to-expert",
+                directory.display()
+            ))
+        })?;
+        Ok(Self {
+            config: toml::from_str(&config).map_err(|e| damaged("config.toml", e.to_string()))?,
+            seeds,
+            task,
+            root: folder.and_then(Path::parent).unwrap_or(Path::new(".")).to_owned(),
+            target: hash("target").ok_or_else(|| damaged("spec.json", "inputs.target: missing".into()))?,
+            source: hash("source"),
+        })
+    }
+
+    /// Refuses data that are not the run's.
+    fn check(&self, inputs: &Inputs) -> Result<()> {
+        let source = self.source.as_ref().zip(inputs.source.as_ref());
+        for (name, expected, found) in
+            [("target", &self.target, &inputs.target)].into_iter().chain(source.map(|(e, f)| ("source", e, f)))
+        {
+            if *expected != found.hash {
+                return Err(Error::Usage(format!(
+                    "{}: SHA-256 {}, but the run's {name} rows have {expected}; name the run's own file with --{name}",
+                    found.file.display(),
+                    found.hash
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl RunArgs {
+    fn run(self, output: Output) -> Result<()> {
+        if let Some(y) = self.y_max.iter().find(|y| !(0.0..=1.0).contains(*y)) {
+            return Err(Error::Usage(format!("--y-max {y}: expected label bounds from 0 to 1")));
+        }
+        let least = 100;
+        for (name, value) in [("--rows", self.rows), ("--abundant", self.abundant)] {
+            if value < least {
+                return Err(Error::Usage(format!(
+                    "{name} {value}: expected at least {least}; figures of fewer rows are noise"
+                )));
+            }
+        }
+        let defaults = Options::default();
+        let options = Options {
+            rows: self.rows,
+            y_max: self.y_max,
+            simulator: !self.no_simulator,
+            transition: TransitionConfig { steps: self.transition_steps, ..defaults.transition },
+            value_steps: self.value_steps,
+            abundant: self.abundant,
+        };
+        let device = cpu();
+        let (diagnosis, place) = match &self.run {
+            Some(directory) => {
+                let run = Finished::read(directory)?;
+                if !self.config.is_empty() {
+                    return Err(Error::Usage(
+                        "--preset, --config and --set belong to files of your own; a run has its configuration".into(),
+                    ));
+                }
+                let root = self.out.unwrap_or_else(|| run.root.clone());
+                let data = DataArgs {
+                    source: self.source,
+                    target: self.target,
+                    from_zoo: self.from_zoo,
+                    out: run.root.clone(),
+                };
+                let inputs = Inputs::of_task(run.task, &data, Some(run.config.source.rows))?;
+                let inputs = inputs.with_target_rows(run.config.target.rows);
+                run.check(&inputs)?;
+                let subject = Subject {
+                    of: directory.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
+                    task: Some(run.task),
+                    inputs: &inputs,
+                    config: &run.config,
+                    seeds: &run.seeds,
+                    seed: self.seed.unwrap_or(run.seeds[0]),
+                };
+                diagnose(&subject, &options, &root, &device)?
+            }
+            None => {
+                let config = self.config.layered(None, Some(Variant::TceOg))?.config()?;
+                let target = self.target.as_deref().expect("clap asks for it");
+                let inputs = Inputs::of_files(self.source.as_deref(), target)?.with_target_rows(config.target.rows);
+                let seed = self.seed.unwrap_or(0);
+                let subject = Subject {
+                    of: target.display().to_string(),
+                    task: None,
+                    inputs: &inputs,
+                    config: &config,
+                    seeds: &[seed],
+                    seed,
+                };
+                diagnose(&subject, &options, &self.out.unwrap_or_else(|| "runs".into()), &device)?
+            }
+        };
+        let page = place.join("diagnosis.html");
+        write_atomically(&page, tce_report::diagnosis_page(&diagnosis).as_bytes())?;
+        let files = vec![place.join("diagnosis.json"), page];
+        output.print(&Written { files, diagnosis }, render_run);
+        Ok(())
+    }
+}
+
+#[derive(Serialize)]
+struct Written {
+    files: Vec<PathBuf>,
+    #[serde(flatten)]
+    diagnosis: Diagnosis,
+}
+
+fn render_run(written: &Written) -> String {
+    let d = &written.diagnosis;
+    let figure = |s: Option<Spread>| s.map_or("-".into(), |s| format!("{:.3}", s.median));
+    let both = |b: &AtBound, f: &dyn Fn(&tce_diagnosis::Reliability) -> Option<Spread>| {
+        format!("{} / {}", figure(f(&b.kept)), figure(b.outliers.as_ref().and_then(f)))
+    };
+    let lines = d.bounds_of_y.iter().map(|b| {
+        [
+            format!("{}", b.y_max),
+            format!("{:.2}", b.coverage.target),
+            b.coverage.source.map_or("-".into(), |s| format!("{s:.2}")),
+            format!("{:.1} %", 100.0 * b.rejected),
+            both(b, &|r| r.distance),
+            both(b, &|r| r.transition_kl),
+            both(b, &|r| r.reward_difference),
+            both(b, &|r| r.reward_error),
+            both(b, &|r| r.consistency),
+        ]
+    });
+    let header = [
+        "y_max",
+        "target covered",
+        "source covered",
+        "rejected",
+        "distance",
+        "KL / dim",
+        "ΔR",
+        "reward error",
+        "consistency",
+    ];
+    let mut text = format!("{}, seed {}: medians of kept / rejected rows\n{}\n", d.of, d.seed, table(&header, lines));
+    if let Some(m) = &d.memorisation {
+        text += &format!(
+            "copies: a generated row is nearer to a training row than a held-out row with probability {:.2}{}\n",
+            m.probability,
+            if m.copied() { ": it looks like a copy" } else { "" }
+        );
+    }
+    if let Some(c) = &d.choice {
+        text += &format!(
+            "λ from the data alone: {} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
+            c.lambda, c.least_bound, c.generated_alone
+        );
+    }
+    for note in &d.notes {
+        text += &format!("note: {note}\n");
+    }
+    for file in &written.files {
+        text += &format!("{}\n", file.display());
+    }
+    text
 }
 
 impl GeneratorArgs {
     fn run(self, output: Output) -> Result<()> {
         let config = self.config.layered(Some(self.task), None)?.config()?;
-        let inputs = Inputs::of_task(self.task, &self.data, Some(config.source.rows))?;
+        let inputs =
+            Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows);
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
         let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };

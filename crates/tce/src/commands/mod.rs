@@ -63,8 +63,7 @@ enum Command {
     #[command(subcommand)]
     Config(config::Config),
     /// Measure what a stage of the pipeline does.
-    #[command(subcommand)]
-    Diagnose(diagnose::Diagnose),
+    Diagnose(Box<diagnose::Diagnose>),
     /// Many runs: planned once, done on one machine or on Slurm, gathered into a table.
     #[command(subcommand)]
     Sweep(sweep::SweepCommand),

@@ -75,8 +75,9 @@ impl Run {
             })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        let source_rows = configs.iter().find(|c| c.needs_source()).map(|c| c.source.rows);
-        let inputs = Inputs::of_task(self.task, &self.data, source_rows)?;
+        // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
+        let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);
+        let inputs = Inputs::of_config(self.task, &self.data, widest)?;
         let mut rows = Vec::new();
         for ((variant, floor), config) in variants.into_iter().zip(&configs) {
             let place = self.task.directory();

@@ -296,6 +296,7 @@ impl Manifest {
             config: hash.clone(),
             needs,
         };
+        let rows = serde_json::json!([config.source, config.target]);
         let mut needs = Vec::new();
         if data.target.is_none() {
             let spec = serde_json::json!([task.agent, task.shift, task.target, from_zoo]);
@@ -306,7 +307,7 @@ impl Manifest {
             needs.push(self.add(known, entry(Kind::Source, spec, 0, Vec::new())));
         }
         if let Some(kind) = config.distances() {
-            let spec = serde_json::json!([task, data, from_zoo, config.source, kind]);
+            let spec = serde_json::json!([task, data, from_zoo, rows, kind]);
             let distances = self.add(known, entry(Kind::Distances, spec, 0, needs.clone()));
             needs.push(distances);
         }
@@ -321,7 +322,7 @@ impl Manifest {
                     serde_json::json!([config.generator, config.filter, config.labels, lambda])
                 }
             };
-            let spec = serde_json::json!([task, data, from_zoo, config.source, generated, own, seed]);
+            let spec = serde_json::json!([task, data, from_zoo, rows, generated, own, seed]);
             let before = needs.clone();
             needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
         }

@@ -190,13 +190,12 @@ impl Sweep {
         let config = self.manifest.config(entry)?;
         let args = self.data(entry);
         let root = &args.out;
-        let rows = config.needs_source().then_some(config.source.rows);
         let seeds = &[entry.seed];
         let (score, place, files) = match entry.kind {
             Kind::Source => data_file(&source_file(entry.task, &args, config.source.rows)?)?,
             Kind::Target => data_file(&target_file(entry.task, &args)?)?,
             Kind::Expand => {
-                let inputs = Inputs::of_task(entry.task, &args, rows)?;
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let stage = match config.mixture.generated {
                     GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, &cpu())?.1,
                     _ => expand(&inputs, &config, seeds, root, &cpu())?.stage,
@@ -204,13 +203,13 @@ impl Sweep {
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
             }
             Kind::Distances => {
-                let inputs = Inputs::of_task(entry.task, &args, rows)?;
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let kind = config.distances().expect("planned for a configuration that has some");
                 let place = distances_stage(&inputs, kind, root)?.1;
                 (None, place.clone(), files_of(&place)?)
             }
             Kind::Run => {
-                let inputs = Inputs::of_task(entry.task, &args, rows)?;
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let name = entry.column().replace(' ', "-");
                 let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), &cpu())?;
                 (summary.scores.first().copied().flatten(), summary.directory.clone(), files_of(&summary.directory)?)

@@ -71,20 +71,21 @@ pub fn consistency(
     live: &[usize],
 ) -> Result<Consistency> {
     let simulated = simulate(agent, shift, &rows.observations, &rows.actions)?.next_observations;
-    let d = rows.obs_dim;
-    let mut errors: Vec<f64> = simulated
-        .chunks_exact(d)
-        .zip(rows.next_observations.chunks_exact(d))
-        .map(|(simulated, generated)| {
-            let square = |(k, &i): (usize, &usize)| ((simulated[i] - generated[i]) as f64 / step_std[k] as f64).powi(2);
-            (live.iter().enumerate().map(square).sum::<f64>() / live.len() as f64).sqrt()
-        })
-        // The physics may blow up in an impossible state; that is an error beyond measure, not one to leave out.
-        .map(|e| if e.is_finite() { e } else { f64::INFINITY })
-        .collect();
+    let mut errors = step_errors(&simulated, rows, step_std, live);
     errors.sort_by(f64::total_cmp);
     let at = |q: f64| errors[((errors.len() - 1) as f64 * q) as usize];
     Ok(Consistency { median: at(0.5), p90: at(0.9) })
+}
+
+/// RMS over the live dimensions of (simulated − s') / std(s' − s), per row.
+pub fn step_errors(simulated: &[f32], rows: &Transitions, step_std: &[f32], live: &[usize]) -> Vec<f64> {
+    let error = |(simulated, generated): (&[f32], &[f32])| {
+        let square = |(k, &i): (usize, &usize)| ((simulated[i] - generated[i]) as f64 / step_std[k] as f64).powi(2);
+        let error = (live.iter().enumerate().map(square).sum::<f64>() / live.len() as f64).sqrt();
+        // The physics may blow up in an impossible state; that is an error beyond measure, not one to leave out.
+        if error.is_finite() { error } else { f64::INFINITY }
+    };
+    simulated.chunks_exact(rows.obs_dim).zip(rows.next_observations.chunks_exact(rows.obs_dim)).map(error).collect()
 }
 
 /// std(s' − s) of the live dimensions of `target`.

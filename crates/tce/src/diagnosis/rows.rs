@@ -1,0 +1,101 @@
+//! Generated rows under a label bound, with all that is known of each: whether the filter keeps it, its labels, and what the
+//! simulator makes of it.
+
+use tce_base::Streams;
+use tce_data::{Agent, Shift, Transitions};
+use tce_diffusion::uniform_labels;
+use tce_sim::{Simulated, simulate};
+
+use crate::config::GeneratorConfig;
+use crate::error::{Error, Result};
+use crate::expand::Finisher;
+use crate::generator::Generator;
+use crate::units::Units;
+
+/// Where rows come from.
+pub struct Sampler<'a> {
+    pub generator: &'a Generator,
+    pub finisher: &'a Finisher<'a>,
+    pub config: &'a GeneratorConfig,
+    pub target: &'a Transitions,
+    /// Of the whole population.
+    pub seeds: &'a [u64],
+    /// The one to look at.
+    pub member: usize,
+    pub simulator: Option<(Agent, Shift)>,
+}
+
+/// Rows of one label bound, those included that the filter rejects.
+pub struct Batch {
+    /// Labelled rows.
+    pub rows: Transitions,
+    /// Whether the filter keeps a row.
+    pub keep: Vec<bool>,
+    /// ŷ of every row.
+    pub labels: Vec<f32>,
+    /// What the target's dynamics do at (ŝ, â).
+    pub simulated: Option<Simulated>,
+}
+
+impl Batch {
+    pub fn len(&self) -> usize {
+        self.keep.len()
+    }
+
+    pub fn kept(&self) -> usize {
+        self.keep.iter().filter(|k| **k).count()
+    }
+
+    /// The rows that pass the filter.
+    pub fn kept_rows(&self) -> Transitions {
+        self.rows.select(&(0..self.len()).filter(|&i| self.keep[i]).collect::<Vec<_>>())
+    }
+
+    /// Their live, standardised states.
+    pub fn kept_states(&self, units: &Units) -> Vec<f32> {
+        units.states(&self.kept_rows().observations)
+    }
+}
+
+impl Sampler<'_> {
+    /// Labels of state pairs by the member's models, whole states in the data's units.
+    pub fn label(&self, s: &[f32], s2: &[f32]) -> Result<Transitions> {
+        let mut pairs = vec![(Vec::new(), Vec::new()); self.seeds.len()];
+        pairs[self.member] = (s.to_vec(), s2.to_vec());
+        Ok(self.finisher.label(&pairs)?.swap_remove(self.member).transitions)
+    }
+
+    /// `rows` rows under ŷ ~ U(0, y_max). Batches of one `purpose` are drawn from the same noise: they differ by their bound alone.
+    pub fn sample(&self, rows: usize, y_max: f32, purpose: &str) -> Result<Batch> {
+        let members: Vec<Streams> =
+            self.seeds.iter().map(|&s| Streams::new(s).child(&format!("diagnosis/{purpose}"))).collect();
+        let Self { generator, config, target, .. } = self;
+        let (units, sampler) = (&generator.units, &config.sampler);
+        let all = generator.sample_states(rows, y_max, sampler, &members, target, None)?;
+        let successors = generator.sample_successors(&all, sampler, &members, target, None)?;
+        let (d, labels) = (units.live.len(), uniform_labels(&members[self.member], "state", rows, y_max));
+        let own = self.member * rows * d..(self.member + 1) * rows * d;
+        // A row that is no numbers can neither be labelled nor simulated.
+        let pairs = all[own.clone()].chunks_exact(d).zip(successors[own].chunks_exact(d)).zip(labels);
+        let (mut s, mut s2, mut kept_labels) = (Vec::new(), Vec::new(), Vec::new());
+        for ((state, successor), label) in pairs {
+            if state.iter().chain(successor).all(|v| v.is_finite()) {
+                s.extend_from_slice(state);
+                s2.extend_from_slice(successor);
+                kept_labels.push(label);
+            }
+        }
+        if kept_labels.is_empty() {
+            return Err(Error::Failed(format!(
+                "none of the {rows} rows generated with y_max = {y_max} is made of finite numbers: the score networks have diverged"
+            )));
+        }
+        let keep = self.finisher.keep(&s, &s2);
+        let rows = self.label(&units.put_back(&s), &units.put_back(&s2))?;
+        let simulated = match self.simulator {
+            Some((agent, shift)) => Some(simulate(agent, shift, &rows.observations, &rows.actions)?),
+            None => None,
+        };
+        Ok(Batch { rows, keep, labels: kept_labels, simulated })
+    }
+}
