@@ -59,6 +59,11 @@ fn number(value: f64) -> String {
     minus(text)
 }
 
+/// A setting as it was written.
+fn plain(value: f64) -> String {
+    minus(format!("{value}"))
+}
+
 fn percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)
 }
@@ -71,7 +76,7 @@ fn lede(d: &Diagnosis) -> String {
         text += &format!(
             "With y_max = {} generated rows cover {} of the target's and {} of the source's states ({} and {} at y_max = 0; the target \
              rows themselves {} of the source's).",
-            number(d.y_max),
+            plain(d.y_max),
             percent(own.coverage.target),
             own.coverage.source.map_or("–".into(), percent),
             percent(zero.coverage.target),
@@ -95,7 +100,7 @@ fn lede(d: &Diagnosis) -> String {
     if let Some(c) = &d.choice {
         text += &match c.lambda {
             0.0 => " The data alone say: λ = 0, generated rows without source rows.".to_owned(),
-            l => format!(" The data alone say: λ = {}, with the nearest source rows.", number(l)),
+            l => format!(" The data alone say: λ = {}, with the nearest source rows.", plain(l)),
         };
     }
     text
@@ -137,8 +142,8 @@ fn one(d: &Diagnosis) -> Markup {
         div class="panels small" { (coverage(d)) (reliability(d)) }
         h3 { "Pictures" }
         div class="panels small" {
-            @if let Some(e) = &d.transitions { (picture("Transitions (s, s')", &format!("y_max = {}", number(d.y_max)), e)) }
-            @for (y, e) in &d.states { (picture("States", &format!("y_max = {}", number(*y)), e)) }
+            @if let Some(e) = &d.transitions { (picture("Transitions (s, s')", &format!("y_max = {}", plain(d.y_max)), e)) }
+            @for (y, e) in &d.states { (picture("States", &format!("y_max = {}", plain(*y)), e)) }
         }
         h3 { "Labels ŷ, z-scores" }
         div class="panels small" { (histograms(d)) }
@@ -402,14 +407,14 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
                         @let best = mixed.iter().max_by(|a, b| a.score.total_cmp(&b.score)).filter(|_| mixed.len() > 1);
                         tr {
                             th scope="row" { (short(task)) }
-                            td { (list(choices.iter().map(|c| number(c.lambda)).collect())) }
-                            td { (list(choices.iter().map(|c| number(c.least)).collect())) }
+                            td { (list(choices.iter().map(|c| plain(c.lambda)).collect())) }
+                            td { (list(choices.iter().map(|c| plain(c.least)).collect())) }
                             td { (list(choices.iter().map(|c| number(c.generated_alone)).collect())) }
                             td { (list(choices.iter().map(|c| number(c.least_bound)).collect())) }
                             td class="edge text" {
-                                (list(mixed.iter().map(|m| format!("{} {}: {} ({} seeds)", m.title, number(m.lambda), minus(format!("{:.1}", m.score)), m.seeds)).collect()))
+                                (list(mixed.iter().map(|m| format!("{} {}: {} ({} seeds)", m.title, plain(m.lambda), minus(format!("{:.1}", m.score)), m.seeds)).collect()))
                             }
-                            td class="text" { @match best { Some(m) => { "λ = " (number(m.lambda)) ", " (m.title) }, None => "–" } }
+                            td class="text" { @match best { Some(m) => { "λ = " (plain(m.lambda)) ", " (m.title) }, None => "–" } }
                         }
                     }
                 }

@@ -30,6 +30,9 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
     if !study.diagnoses.is_empty() {
         sections.insert(3, ("diagnoses", "Generated rows and λ", crate::diagnosis::section(study, analysis)));
     }
+    if let Some(section) = crate::sensitivity::section(study, analysis) {
+        sections.insert(2, ("sensitivity", "Sensitivity", section));
+    }
     let body = html! {
         (head(study, analysis))
         (warnings(analysis))

@@ -10,6 +10,7 @@ pub mod error;
 pub mod folder;
 pub mod html;
 pub mod paper;
+pub mod sensitivity;
 pub mod stats;
 pub mod study;
 pub mod svg;

@@ -91,6 +91,20 @@ fn in_group(directory: &Path, args: &[&str]) -> Child {
 }
 
 #[test]
+fn every_example_is_a_plan() {
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+    let dir = tempfile::tempdir().unwrap();
+    let plans = common::files(&examples).into_iter().filter(|p| p.extension().is_some_and(|e| e == "toml"));
+    let mut seen = 0;
+    for plan in plans {
+        let planned = tce_json(dir.path(), &["sweep", "plan", plan.to_str().unwrap(), "--dry-run"]);
+        assert!(planned["run"].as_u64().unwrap() >= 30, "{}: {planned}", plan.display());
+        seen += 1;
+    }
+    assert!(seen >= 9, "{seen} plans");
+}
+
+#[test]
 fn a_sweep_survives_its_launcher_and_its_workers() {
     let dir = tempfile::tempdir().unwrap();
     let file = describe(dir.path(), "s", 1);

@@ -42,6 +42,8 @@ use rows::{Batch, Sampler};
 
 /// Changes when the same rows would give other figures.
 const VERSION: u32 = 1;
+/// With fewer target rows neighbourhoods mean nothing.
+const FEWEST: usize = 100;
 /// Reference states of each domain behind a coverage.
 const REFERENCE: usize = 2000;
 /// Points of each group in a picture.
@@ -123,9 +125,16 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         .iter()
         .position(|s| *s == seed)
         .ok_or_else(|| Error::Usage(format!("--seed {seed}: the run's seeds are {seeds:?}; choose one of them")))?;
+    let found = inputs.target.rows.len();
+    if found < FEWEST {
+        return Err(Error::Usage(format!(
+            "{}: found {found} target rows, expected at least {FEWEST}: nothing can be said of generated rows beside so few",
+            inputs.target.file.display()
+        )));
+    }
     let used = serde_json::json!({
         "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
-        "iql": config.learner.iql,
+        "iql": config.learner.iql, "batch": config.learner.batch,
     });
     let spec = Spec { version: VERSION, inputs: inputs.spec(true), config: used, seeds, seed, options };
     let stage = Stage::open(root, "stages/diagnosis", &spec)?;
