@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use common::{files, message, program, silent, tce, tce_json};
 
 const POLICY: &str = "zoo:hopper-source-expert";
-const SMALL: [&str; 2] = ["--video-size", "240x180"];
+const SMALL: [&str; 2] = ["--video-size", "320x240"];
 
 /// Size, number of frames, delays in hundredths of a second, whether it repeats for ever, and every frame as it is seen.
 struct Decoded {
@@ -63,7 +63,7 @@ fn a_film_shows_the_episodes_that_the_table_counts() {
 
     // 2 s of 25 pictures.
     let decoded = decode(&dir.path().join("film.gif"));
-    assert_eq!((decoded.size, decoded.pictures.len(), decoded.endless), ([482, 180], 50, true));
+    assert_eq!((decoded.size, decoded.pictures.len(), decoded.endless), ([642, 240], 50, true));
     assert!(decoded.delays.iter().all(|&delay| delay == 4), "{:?}", decoded.delays);
     assert!((1..50).all(|k| decoded.pictures[k] != decoded.pictures[k - 1]), "something moves in every picture");
     assert_eq!(shown["frames"], 50);
@@ -82,7 +82,7 @@ fn the_same_bytes_at_any_number_of_threads() {
     let one = bytes("one.gif", "1");
     assert!(one == bytes("three.gif", "3"));
     // Without a shift there is nothing to compare with: one panel.
-    assert_eq!(decode(&dir.path().join("one.gif")).size, [240, 180]);
+    assert_eq!(decode(&dir.path().join("one.gif")).size, [320, 240]);
     let other = film(dir.path(), "hopper", "other.gif", &["--video-seconds", "1", "--sample"]);
     assert_eq!(other[0]["video"]["panels"].as_array().unwrap().len(), 1);
     assert!(one != fs::read(dir.path().join("other.gif")).unwrap());
@@ -141,8 +141,8 @@ fn ffmpeg_gets_every_pixel_and_its_complaints_are_passed_on() {
     let output = run(" V libx264", "wc -c > \"$out\"; echo \"$*\" >> \"$out\"");
     assert!(output.status.success(), "{}", message(&output));
     let told = fs::read_to_string(dir.path().join("film.mp4")).unwrap();
-    assert_eq!(told.split_whitespace().next(), Some((10 * 482 * 180 * 3).to_string().as_str()));
-    for words in ["-video_size 482x180", "-framerate 1000000/40000", "-pix_fmt yuv420p", "libx264"] {
+    assert_eq!(told.split_whitespace().next(), Some((10 * 642 * 240 * 3).to_string().as_str()));
+    for words in ["-video_size 642x240", "-framerate 1000000/40000", "-pix_fmt yuv420p", "libx264"] {
         assert!(told.contains(words), "{words}: {told}");
     }
     let whole = fs::read(dir.path().join("film.mp4")).unwrap();

@@ -42,12 +42,12 @@ pub fn parse_video(text: &str) -> Result<VideoFile, String> {
     Ok(VideoFile { path, format })
 }
 
-/// Reads the size of a panel, `480x360`. H.264 takes even numbers only.
+/// Reads the size of a panel, `480x360`. H.264 takes even numbers only; labels need 320 columns.
 pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
-    let expected = "expected WIDTHxHEIGHT, even numbers from 240x180 to 1920x1080, as in 480x360";
+    let expected = "expected WIDTHxHEIGHT, even numbers from 320x240 to 1920x1080, as in 480x360";
     let numbers = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
     let [width, height]: [usize; 2] = numbers.ok_or(expected)?;
-    let fits = (240..=1920).contains(&width) && (180..=1080).contains(&height);
+    let fits = (320..=1920).contains(&width) && (240..=1080).contains(&height);
     if fits && width % 2 == 0 && height % 2 == 0 { Ok([width, height]) } else { Err(expected.to_owned()) }
 }
 
@@ -125,7 +125,7 @@ mod tests {
     #[test]
     fn sizes_are_even_and_of_use() {
         assert_eq!(parse_size("480x360"), Ok([480, 360]));
-        for text in ["480", "481x360", "480x-2", "100x100", "4000x1000", "480 x 360"] {
+        for text in ["480", "481x360", "480x-2", "240x180", "4000x1000", "480 x 360"] {
             assert!(parse_size(text).unwrap_err().contains("480x360"), "{text}");
         }
     }
