@@ -108,7 +108,7 @@ impl Env {
     pub(crate) fn with_model(agent: Agent, model: Arc<MjModel>) -> Self {
         let task = task(agent);
         let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").expect("every robot has a torso");
-        let dt = model.opt().timestep * task.frame_skip as f64;
+        let dt = seconds_per_step(agent, &model);
         Self { agent, task, data: MjData::new(model), dt, torso, x: 0.0 }
     }
 
@@ -232,6 +232,11 @@ impl Env {
             *o = self.task.velocity_clip.map_or(v, |clip| v.clamp(-clip, clip)) as f32;
         }
     }
+}
+
+/// Seconds per step of `agent`'s environments with this model.
+pub(crate) fn seconds_per_step(agent: Agent, model: &MjModel) -> f64 {
+    model.opt().timestep * task(agent).frame_skip as f64
 }
 
 /// Copies the leading numbers of `from` into `to`.

@@ -6,18 +6,24 @@
 //! | One environment? | [`Env`] |
 //! | A data set? | [`collect`] |
 //! | A policy's returns? | [`evaluate`] |
+//! | What it looks like? | [`evaluate_recorded`], then a [`film::Film`] of the recordings |
 //! | Do stored transitions follow the dynamics? | [`replay`] (whole data sets), [`simulate`] (single rows) |
 //! | Would a generated state end the episode? | [`terminal_rule`] |
 
+mod actor;
 mod analysis;
 mod env;
 mod error;
+pub mod film;
 pub mod models;
+mod recording;
 mod replay;
 mod rollout;
 
+pub use actor::{Actor, UniformActor};
 pub use analysis::{Simulated, simulate};
 pub use env::{EPISODE_LIMIT, Env, StepResult, terminal_rule};
 pub use error::SimError;
+pub use recording::{Ending, Recording};
 pub use replay::{Quantiles, ReplayReport, replay};
-pub use rollout::{Actor, CollectOptions, EpisodeResult, UniformActor, collect, evaluate};
+pub use rollout::{CollectOptions, EpisodeResult, collect, evaluate, evaluate_recorded};

@@ -7,54 +7,11 @@ use std::sync::Arc;
 use tce_base::{Progress, Rng, Streams, interrupted};
 use tce_data::{Agent, Shift, Transitions};
 
+use crate::actor::Actor;
 use crate::env::{EPISODE_LIMIT, Env};
 use crate::models::compiled;
+use crate::recording::{Ending, Recording};
 use crate::{SimError, StepResult};
-
-/// Something that chooses actions.
-pub trait Actor: Sync {
-    /// What a lane remembers of its episode; `()` for actors that look at the observation alone.
-    type Memory: Send;
-
-    /// The memory of a lane whose episode begins.
-    fn start(&self) -> Self::Memory;
-
-    /// Fills `actions` (`[rows, act_dim]`, row-major, in [-1, 1]) for `observations` (`[rows, obs_dim]`).
-    /// `memories` and `rngs` hold one memory and one generator per row, the latter for actors that sample; a row's numbers must
-    /// come from its own of both only, so that they do not depend on which other rows are in the batch.
-    fn act(&self, observations: &[f32], memories: &mut [Self::Memory], rngs: &mut [Rng], actions: &mut [f32]);
-
-    /// Tells a lane's memory the reward of the action that was just taken, if the episode goes on.
-    fn reward(&self, _memory: &mut Self::Memory, _reward: f64) {}
-}
-
-impl<F: Fn(&[f32], &mut [Rng], &mut [f32]) + Sync> Actor for F {
-    type Memory = ();
-
-    fn start(&self) {}
-
-    fn act(&self, observations: &[f32], _: &mut [()], rngs: &mut [Rng], actions: &mut [f32]) {
-        self(observations, rngs, actions)
-    }
-}
-
-/// Uniformly random actions.
-#[derive(Clone, Copy, Debug)]
-pub struct UniformActor;
-
-impl Actor for UniformActor {
-    type Memory = ();
-
-    fn start(&self) {}
-
-    fn act(&self, _: &[f32], _: &mut [()], rngs: &mut [Rng], actions: &mut [f32]) {
-        let dim = actions.len() / rngs.len().max(1);
-        for (rng, row) in rngs.iter_mut().zip(actions.chunks_exact_mut(dim)) {
-            tce_base::random::fill_uniform(rng, row);
-            row.iter_mut().for_each(|a| *a = 2.0 * *a - 1.0);
-        }
-    }
-}
 
 /// How to collect.
 #[derive(Clone, Copy)]
@@ -315,18 +272,37 @@ pub fn collect<A: Actor>(
 struct Evaluator {
     index: usize,
     result: EpisodeResult,
+    recording: Option<Recording>,
+}
+
+impl Evaluator {
+    /// How the episode ended with this step, if it did.
+    fn ending(&self, step: StepResult) -> Option<Ending> {
+        match step {
+            StepResult { unstable: true, .. } => Some(Ending::Unstable),
+            StepResult { terminal: true, .. } => Some(Ending::Fell),
+            _ => (self.result.length == EPISODE_LIMIT).then_some(Ending::TimeLimit),
+        }
+    }
 }
 
 impl Lane for Evaluator {
-    fn advance(&mut self, _: &mut Env, step: Step<'_>, _: &mut Rng) -> Next {
+    fn advance(&mut self, env: &mut Env, step: Step<'_>, _: &mut Rng) -> Next {
         let result = &mut self.result;
         if step.result.unstable {
             result.unstable = true;
-            return Next::Leave;
+        } else {
+            result.episode_return += step.result.reward;
+            result.length += 1;
+            if let Some(recording) = &mut self.recording {
+                recording.push(env.qpos(), result.episode_return);
+            }
         }
-        result.episode_return += step.result.reward;
-        result.length += 1;
-        if step.result.terminal || result.length == EPISODE_LIMIT { Next::Leave } else { Next::Step }
+        let ending = self.ending(step.result);
+        if let (Some(recording), Some(ending)) = (&mut self.recording, ending) {
+            recording.ending = ending;
+        }
+        if ending.is_some() { Next::Leave } else { Next::Step }
     }
 }
 
@@ -344,13 +320,51 @@ pub fn evaluate<A: Actor>(
     streams: Streams,
     stop: impl Fn() -> bool,
 ) -> Result<Vec<EpisodeResult>, SimError> {
+    let lanes = evaluate_lanes(agent, shift, actor, episodes, streams, false, stop)?;
+    Ok(lanes.into_iter().map(|lane| lane.result).collect())
+}
+
+/// [`evaluate`], with a recording of the first episode. Watching changes nothing: the outcomes are the same bits.
+///
+/// # Errors
+/// As [`evaluate`]; also if `episodes` is 0.
+pub fn evaluate_recorded<A: Actor>(
+    agent: Agent,
+    shift: Shift,
+    actor: &A,
+    episodes: usize,
+    streams: Streams,
+    stop: impl Fn() -> bool,
+) -> Result<(Vec<EpisodeResult>, Recording), SimError> {
+    let mut lanes = evaluate_lanes(agent, shift, actor, episodes, streams, true, stop)?;
+    let recording = lanes.first_mut().and_then(|lane| lane.recording.take());
+    let recording = recording.ok_or(SimError::Option { option: "episodes", found: 0, expected: "at least 1" })?;
+    Ok((lanes.into_iter().map(|lane| lane.result).collect(), recording))
+}
+
+fn evaluate_lanes<A: Actor>(
+    agent: Agent,
+    shift: Shift,
+    actor: &A,
+    episodes: usize,
+    streams: Streams,
+    record: bool,
+    stop: impl Fn() -> bool,
+) -> Result<Vec<Evaluator>, SimError> {
     let model = compiled(agent, shift)?;
     let starts = (0..episodes).map(|index| {
         let result = EpisodeResult { episode_return: 0.0, length: 0, unstable: false };
+        let recording = (record && index == 0).then(|| Recording::new(agent, shift));
         let i = index as u64;
-        (Evaluator { index, result }, streams.indexed("evaluate/reset", i), streams.indexed("evaluate/action", i))
+        let lane = Evaluator { index, result, recording };
+        (lane, streams.indexed("evaluate/reset", i), streams.indexed("evaluate/action", i))
     });
     let mut lockstep = Lockstep::new(agent, &model, actor, starts);
+    for (env, lane) in &mut lockstep.lanes {
+        if let Some(recording) = &mut lane.recording {
+            recording.push(env.qpos(), 0.0);
+        }
+    }
     let mut finished = Vec::with_capacity(episodes);
     while !lockstep.lanes.is_empty() {
         if stop() {
@@ -359,5 +373,5 @@ pub fn evaluate<A: Actor>(
         lockstep.tick(&mut finished)?;
     }
     finished.sort_by_key(|lane| lane.index);
-    Ok(finished.into_iter().map(|lane| lane.result).collect())
+    Ok(finished)
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Rng, Streams, move_into_place, sha256_file, sha256_hex};
 use tce_data::{Agent, Quality, ReferenceScores, ScoreTable, Shift, Transitions, reference_scores, save_d4rl};
 use tce_learn::{Memory, Policy};
-use tce_sim::{Actor, CollectOptions, EpisodeResult};
+use tce_sim::{Actor, CollectOptions, EpisodeResult, Recording};
 
 use crate::PROGRAM;
 use crate::error::{Error, Result};
@@ -275,4 +275,18 @@ pub fn evaluate(
     let actor = PolicyActor::new(policy.clone(), mean);
     let results = tce_sim::evaluate(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
     Ok(Evaluation::of(&results, arena.reference))
+}
+
+/// [`evaluate`] with a recording of the first episode.
+pub fn evaluate_recorded(
+    policy: &Policy,
+    arena: Arena,
+    episodes: usize,
+    streams: Streams,
+    mean: bool,
+    stop: impl Fn() -> bool,
+) -> Result<(Evaluation, Recording)> {
+    let actor = PolicyActor::new(policy.clone(), mean);
+    let (results, recording) = tce_sim::evaluate_recorded(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
+    Ok((Evaluation::of(&results, arena.reference), recording))
 }

@@ -27,6 +27,7 @@ mod study;
 mod sweep;
 mod units;
 mod variant;
+mod video;
 mod zoo;
 
 /// What files say about who wrote them.

@@ -17,11 +17,11 @@ pub struct MassProperties {
     pub inertia: [[f64; 3]; 3],
 }
 
-fn dot(a: Vec3, b: Vec3) -> f64 {
+pub(crate) fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn minus(a: Vec3, b: Vec3) -> Vec3 {
+pub(crate) fn minus(a: Vec3, b: Vec3) -> Vec3 {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 

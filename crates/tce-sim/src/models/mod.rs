@@ -2,6 +2,7 @@
 
 mod agents;
 mod compiled;
+mod difference;
 pub mod inertia;
 mod mjcf;
 pub mod robot;
@@ -10,6 +11,7 @@ mod shifts;
 use tce_data::{Agent, Shift};
 
 pub use compiled::compiled;
+pub use difference::{Difference, difference};
 
 use robot::Robot;
 
