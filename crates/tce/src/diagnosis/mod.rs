@@ -4,6 +4,7 @@
 //! |---|---|
 //! | rows over y_max: sampled, filtered, labelled, simulated | `rows.rs` |
 //! | abundant target rows, and the models that are compared | `models.rs` |
+//! | every figure of a diagnosis | `measures.rs` |
 //! | one sampler beside others (`tce diagnose generator`) | `generator.rs` |
 //! | the measures themselves | the crate `tce-diagnosis` |
 //!
@@ -11,47 +12,33 @@
 //! (`simulator = false`), what needs it is left out and named in the notes; λ is chosen without it in any case.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use rand::seq::index;
 use serde::{Deserialize, Serialize};
-use tce_base::{Streams, write_json};
-use tce_data::{NeighbourOptions, Rows, Task, Transitions, nn_distances, zscore_keep};
-use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation,
-    Reliability, Sampled, Spread, coverage, gaussian, memorisation,
-};
+use tce_base::write_json;
+use tce_data::Task;
+use tce_diagnosis::Diagnosis;
 use tce_learn::TransitionConfig;
 use tce_nn::Device;
 
-use crate::config::{Config, GeneratedRows, SourceRows};
+use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::expand::{Finisher, label_models};
 use crate::generator::Generator;
 use crate::inputs::Inputs;
-use crate::mixture::distances;
 use crate::stage::Stage;
-use crate::units::Units;
 
 pub mod generator;
+mod measures;
 mod models;
 mod rows;
 
-use models::Models;
-use rows::{Batch, Sampler};
+use measures::Work;
+use rows::Sampler;
 
 /// Changes when the same rows would give other figures.
 const VERSION: u32 = 1;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
-/// Reference states of each domain behind a coverage.
-const REFERENCE: usize = 2000;
-/// Points of each group in a picture.
-const POINTS: usize = 400;
-/// Source rows behind Theorem 1.
-const SOURCES: usize = 20_000;
-/// The share of source rows that is called nearest where the run itself has no λ.
-const NEAREST: f64 = 0.05;
 
 /// What `tce diagnose` is told.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -183,355 +170,4 @@ pub fn read(path: &Path) -> Result<Diagnosis> {
             path.display()
         ))
     })
-}
-
-struct Work<'a> {
-    subject: &'a Subject<'a>,
-    options: &'a Options,
-    root: &'a Path,
-    sampler: &'a Sampler<'a>,
-    simulator: Option<(tce_data::Agent, tce_data::Shift)>,
-}
-
-/// Source rows that stand for all of them, the nearest to the target first.
-struct Sources {
-    sorted: Transitions,
-    nearest: Transitions,
-}
-
-impl Work<'_> {
-    fn units(&self) -> &Units {
-        &self.sampler.generator.units
-    }
-
-    fn done(
-        &self,
-        label_errors: Option<tce_learn::LabelErrors>,
-        attempt: &crate::stage::Attempt,
-        device: &Device,
-    ) -> Result<Diagnosis> {
-        let Self { subject, options, sampler, .. } = self;
-        let Subject { inputs, config, seed, .. } = **subject;
-        let streams = Streams::new(seed).child("diagnosis");
-        let target = &inputs.target.rows;
-        let mut notes = Vec::new();
-        let mut grid = options.y_max.clone();
-        grid.extend([0.0, config.generator.y_max]);
-        grid.sort_by(f32::total_cmp);
-        grid.dedup();
-        let batches = grid.iter().map(|&y| sampler.sample(options.rows, y, "figures")).collect::<Result<Vec<_>>>()?;
-        let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
-        let own = &batches[at(config.generator.y_max)];
-        let sources = self.sources(&streams)?;
-        let models = Models::train(
-            self,
-            sources.as_ref().map(|s| &s.sorted),
-            own,
-            *grid.last().expect("a grid"),
-            attempt,
-            device,
-        )?;
-        if self.simulator.is_none() {
-            let why =
-                if options.simulator { "its task is not one of the benchmark's" } else { "it was not to be used" };
-            notes.push(format!(
-                "Without the simulator ({why}) there are no abundant target rows: no transition KL, no reward error, no consistency, \
-                 and Theorem 1 by models of the target rows alone."
-            ));
-        }
-        let references = self.references(&streams, sources.as_ref())?;
-        let covered = |states: &[f32]| -> Result<Coverage> {
-            let (target, source) = &references;
-            let source = source.as_ref().map(|s| s.covered_by(states)).transpose()?;
-            Ok(Coverage { target: target.covered_by(states)?, source })
-        };
-        let covered_by_target = covered(&self.units().states(&target.observations))?;
-        let distances = self.distances_to_real(&batches)?;
-        let mut bounds_of_y = Vec::new();
-        for ((&y, batch), distances) in grid.iter().zip(&batches).zip(&distances) {
-            let figures = Figures::of(batch, distances, &models, self)?;
-            bounds_of_y.push(AtBound {
-                y_max: decimal(y),
-                coverage: covered(&batch.kept_states(self.units()))?,
-                rejected: 1.0 - batch.kept() as f64 / batch.len() as f64,
-                kept: figures.reliability(batch, true),
-                outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
-            });
-        }
-        let memorisation = self.memorisation(&batches[at(0.0)])?;
-        if memorisation.is_none() {
-            notes.push("The target rows are one episode: there are no held-out rows to tell copies by.".into());
-        }
-        let theorem = sources.as_ref().map(|s| self.theorem(s, own, &models, &streams)).transpose()?;
-        if theorem.is_none() {
-            notes.push("Without source rows there is no λ to choose.".into());
-        }
-        let mut states = Vec::new();
-        for y in [0.0, config.generator.y_max, *grid.last().expect("a grid")] {
-            if states.iter().all(|(other, _)| *other != decimal(y)) {
-                let picture = self.picture(&batches[at(y)], sources.as_ref(), &streams, false);
-                states.extend(picture.map(|p| (decimal(y), p)));
-            }
-        }
-        Ok(Diagnosis {
-            of: subject.of.clone(),
-            task: subject.task,
-            seed,
-            y_max: decimal(config.generator.y_max),
-            z_threshold: config.filter.enabled.then_some(config.filter.z_threshold),
-            lambda: config.mixture.lambda,
-            rows: options.rows,
-            target_rows: target.len(),
-            covered_by_target,
-            bounds_of_y,
-            sampled: self.sampled(own),
-            transitions: self.picture(own, sources.as_ref(), &streams, true),
-            states,
-            memorisation,
-            labels: self.labels(label_errors, own, &models)?,
-            choice: theorem.as_ref().and_then(|t| t.value_alone.as_ref()).map(Choice::of),
-            theorem,
-            notes,
-        })
-    }
-
-    /// A sample of the source rows in the order of their distances to the target (Eq. 9), and of the nearest share.
-    fn sources(&self, streams: &Streams) -> Result<Option<Sources>> {
-        let Subject { inputs, config, .. } = *self.subject;
-        let Some(source) = &inputs.source else { return Ok(None) };
-        let (all, distances) = (&source.rows, distances(inputs, SourceRows::Nearest, self.root)?);
-        let mut order: Vec<usize> = (0..all.len()).collect();
-        order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]).then(a.cmp(&b)));
-        let pick = |from: &[usize], name: &str| {
-            let count = SOURCES.min(from.len());
-            let mut places = index::sample(&mut streams.stream(name), from.len(), count).into_vec();
-            places.sort_unstable();
-            all.select(&places.into_iter().map(|i| from[i]).collect::<Vec<_>>())
-        };
-        let share =
-            if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
-        let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
-        Ok(Some(Sources { sorted: pick(&order, "sources"), nearest: pick(&order[..near], "nearest") }))
-    }
-
-    /// Target and source states that coverage is counted over.
-    fn references(
-        &self,
-        streams: &Streams,
-        sources: Option<&Sources>,
-    ) -> Result<(coverage::Reference, Option<coverage::Reference>)> {
-        let reference = |t: &Transitions, name: &str| {
-            let rows = few(t, REFERENCE, streams, name);
-            coverage::Reference::new(self.units().states(&rows.observations), self.units().live.len())
-        };
-        let source = sources.map(|s| reference(&s.sorted, "reference/source")).transpose()?;
-        Ok((reference(&self.subject.inputs.target.rows, "reference/target")?, source))
-    }
-
-    /// For every batch, the distance of every row's state to the nearest one of target and source.
-    fn distances_to_real(&self, batches: &[Batch]) -> Result<Vec<Vec<f32>>> {
-        let (units, inputs) = (self.units(), self.subject.inputs);
-        let d = units.live.len();
-        let mut real = units.states(&inputs.target.rows.observations);
-        if let Some(source) = &inputs.source {
-            real.extend(units.states(&source.rows.observations));
-        }
-        let all: Vec<f32> = batches.iter().flat_map(|b| units.states(&b.rows.observations)).collect();
-        let nearest = nn_distances(&Rows::new(&all, d), &Rows::new(&real, d), &NeighbourOptions::default())?;
-        let mut rest = &nearest[..];
-        let mut take = |b: &Batch| {
-            let (own, others) = rest.split_at(b.len());
-            rest = others;
-            own.to_vec()
-        };
-        Ok(batches.iter().map(&mut take).collect())
-    }
-
-    fn memorisation(&self, at_zero: &Batch) -> Result<Option<Memorisation>> {
-        let (units, target) = (self.units(), &self.subject.inputs.target.rows);
-        let d = 2 * units.live.len();
-        let training = pairs(units, target);
-        let episodes: Vec<_> = target.episodes().iter().map(|e| e.start..e.end).collect();
-        let Some(held_out) = memorisation::distances_between_episodes(&training, d, &episodes)? else {
-            return Ok(None);
-        };
-        let generated = pairs(units, &at_zero.rows);
-        let options = NeighbourOptions::default();
-        let generated = nn_distances(&Rows::new(&generated, d), &Rows::new(&training, d), &options)?;
-        Ok(Memorisation::of(&generated, &held_out))
-    }
-
-    fn sampled(&self, own: &Batch) -> Sampled {
-        let Subject { inputs, config, .. } = *self.subject;
-        let units = self.units();
-        let y_max = decimal(config.generator.y_max).max(1e-6);
-        let labels = |kept: bool| {
-            let of = own.labels.iter().zip(&own.keep).filter(|(_, k)| **k == kept).map(|(y, _)| f64::from(*y));
-            Histogram::of(of.collect::<Vec<_>>(), 0.0, y_max, 20)
-        };
-        let z = |t: &Transitions| {
-            let (s, s2, d) = (units.take(&t.observations), units.take(&t.next_observations), units.live.len());
-            let rows = Rows::join(&[(&s, d), (&s2, d)]);
-            let kept = zscore_keep(&rows, config.filter.z_threshold);
-            let rejected = kept.iter().filter(|k| !**k).count() as f64 / kept.len().max(1) as f64;
-            (Histogram::of(tce_data::largest_z(&rows), 0.0, 8.0, 32), rejected)
-        };
-        let (z_real, real_rejected) = z(&inputs.target.rows);
-        Sampled { y_kept: labels(true), y_rejected: labels(false), z: z(&own.rows).0, z_real, real_rejected }
-    }
-
-    /// Points of the groups: whole transitions with the nearest source rows among them, or states without.
-    fn picture(
-        &self,
-        batch: &Batch,
-        sources: Option<&Sources>,
-        streams: &Streams,
-        transitions: bool,
-    ) -> Option<Embedding> {
-        let units = self.units();
-        let points = |t: &Transitions, name: &str| {
-            let rows = few(t, POINTS, streams, &format!("picture/{name}"));
-            if transitions { pairs(units, &rows) } else { units.states(&rows.observations) }
-        };
-        let mut groups = Vec::new();
-        if let Some(s) = sources {
-            groups.push((Group::Source, points(&s.sorted, "source")));
-            if transitions {
-                groups.push((Group::NearestSource, points(&s.nearest, "nearest source")));
-            }
-        }
-        groups.push((Group::Target, points(&self.subject.inputs.target.rows, "target")));
-        groups.push((Group::Generated, points(&batch.kept_rows(), "generated")));
-        Embedding::of(&groups, if transitions { 2 } else { 1 } * units.live.len(), streams)
-    }
-
-    fn labels(&self, held_out: Option<tce_learn::LabelErrors>, own: &Batch, models: &Models) -> Result<Labels> {
-        let errors = |rows: Option<&Transitions>| -> Result<Option<(f64, f64)>> {
-            let Some(rows) = rows.filter(|r| !r.is_empty()) else { return Ok(None) };
-            let found = self.sampler.label(&rows.observations, &rows.next_observations)?;
-            Ok(Some((rmse(&found.actions, &rows.actions), rmse(&found.rewards, &rows.rewards))))
-        };
-        let terminal = own.simulated.as_ref().map(|s| {
-            let kept = own.keep.iter().zip(own.rows.terminals.iter().zip(&s.terminals)).filter(|(k, _)| **k);
-            let wrong = kept.filter(|(_, (found, truth))| found != truth).count();
-            wrong as f64 / own.kept().max(1) as f64
-        });
-        Ok(Labels {
-            held_out_action: held_out.map(|e| (e.action_rmse, e.action_std)),
-            held_out_reward: held_out.map(|e| (e.reward_rmse, e.reward_std)),
-            at_source: errors(models.at_source.as_ref())?,
-            at_generated: errors(models.at_generated.as_ref())?,
-            terminal,
-        })
-    }
-
-    /// Theorem 1 over λ.
-    fn theorem(&self, sources: &Sources, own: &Batch, models: &Models, streams: &Streams) -> Result<Bounds> {
-        let Subject { inputs, config, .. } = *self.subject;
-        let generated = own.kept_rows();
-        let tv = |truth: usize| -> Option<Curve> {
-            let against = |t: &Transitions, own: Option<usize>| -> Option<Vec<f64>> {
-                let densities = models.densities(&t.observations, &t.actions);
-                let (p, q) = (&densities[own?], &densities[truth]);
-                Some(gaussian::total_variation(models.normals(p), models.normals(q), streams))
-            };
-            Curve::of(&against(&sources.sorted, models.source)?, &against(&generated, Some(models.generated))?)
-        };
-        let transition = models.abundant.and_then(tv);
-        let value = match self.simulator {
-            None => None,
-            Some((agent, shift)) => {
-                let gap = |t: &Transitions| -> Result<Vec<f64>> {
-                    let truth = tce_sim::simulate(agent, shift, &t.observations, &t.actions)?;
-                    Ok(models.value_gap(t, &truth.next_observations, &truth.terminals))
-                };
-                Curve::of(&gap(&sources.sorted)?, &gap(&generated)?)
-            }
-        };
-        let alone = |t: &Transitions| models.value_gap_alone(t, inputs.agent);
-        Ok(Bounds {
-            discount: config.learner.iql.discount,
-            r_max: inputs.target.rows.rewards.iter().fold(0.0, |m, r| f64::from(r.abs()).max(m)),
-            transition,
-            value,
-            transition_alone: tv(models.limited[0]),
-            value_alone: Curve::of(&alone(&sources.sorted), &alone(&generated)),
-        })
-    }
-}
-
-/// One number per row of a batch, for every figure that can be measured.
-struct Figures {
-    distance: Vec<f64>,
-    transition_kl: Option<Vec<f64>>,
-    reward_difference: Option<Vec<f64>>,
-    reward_error: Option<Vec<f64>>,
-    consistency: Option<Vec<f64>>,
-}
-
-impl Figures {
-    fn of(batch: &Batch, distances: &[f32], models: &Models, work: &Work) -> Result<Self> {
-        let t = &batch.rows;
-        let kl = |abundant: usize| {
-            let densities = models.densities(&t.observations, &t.actions);
-            let (p, q) = (models.normals(&densities[models.limited[0]]), models.normals(&densities[abundant]));
-            gaussian::kl(p, q).into_iter().map(|v| v / p.dim as f64).collect()
-        };
-        let difference = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).collect();
-        let units = work.units();
-        let step = generator::step_std(&work.subject.inputs.target.rows, &units.live);
-        Ok(Self {
-            distance: distances.iter().map(|d| f64::from(*d)).collect(),
-            transition_kl: models.abundant.map(kl),
-            reward_difference: models.abundant_rewards(t)?.map(|r| difference(&t.rewards, &r)),
-            reward_error: batch.simulated.as_ref().map(|s| difference(&t.rewards, &s.rewards)),
-            consistency: (batch.simulated.as_ref())
-                .map(|s| generator::step_errors(&s.next_observations, t, &step, &units.live)),
-        })
-    }
-
-    fn reliability(&self, batch: &Batch, kept: bool) -> Reliability {
-        let chosen = |v: &Vec<f64>| {
-            Spread::of(v.iter().zip(&batch.keep).filter(|(_, k)| **k == kept).map(|(v, _)| *v).collect::<Vec<_>>())
-        };
-        Reliability {
-            rows: batch.keep.iter().filter(|k| **k == kept).count(),
-            distance: chosen(&self.distance),
-            transition_kl: self.transition_kl.as_ref().and_then(chosen),
-            reward_difference: self.reward_difference.as_ref().and_then(chosen),
-            reward_error: self.reward_error.as_ref().and_then(chosen),
-            consistency: self.consistency.as_ref().and_then(chosen),
-        }
-    }
-}
-
-/// `count` rows at random, in their order.
-fn few(t: &Transitions, count: usize, streams: &Streams, name: &str) -> Transitions {
-    if t.len() <= count {
-        return t.clone();
-    }
-    let mut rows = index::sample(&mut streams.stream(name), t.len(), count).into_vec();
-    rows.sort_unstable();
-    t.select(&rows)
-}
-
-/// (s, s') of live dimensions in units of the states, `[N, 2 d]`.
-fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
-    let d = units.live.len();
-    let (s, s2) = (units.states(&t.observations), units.states(&t.next_observations));
-    s.chunks_exact(d).zip(s2.chunks_exact(d)).flat_map(|(s, s2)| [s, s2].concat()).collect()
-}
-
-/// As it is written: .1 and not .10000000149.
-fn decimal(y: f32) -> f64 {
-    y.to_string().parse().unwrap_or(f64::from(y))
-}
-
-fn rmse(a: &[f32], b: &[f32]) -> f64 {
-    (a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / a.len().max(1) as f64).sqrt()
-}
-
-/// A table that several members share.
-fn shared(t: Transitions) -> Arc<Transitions> {
-    Arc::new(t)
 }

@@ -22,11 +22,14 @@ use tce_learn::{
 use tce_nn::Device;
 use tce_sim::{simulate, terminal_rule};
 
-use super::{Batch, Work, few, shared};
+use super::measures::{Work, few};
+use super::rows::Batch;
 use crate::error::{Error, Result};
 use crate::stage::Attempt;
 use crate::units::even_standardizer;
 
+/// Fewer source rows than this make no model.
+const FEWEST_SOURCES: usize = 1000;
 /// Members of the population that are trained on the target rows.
 const LIMITED: usize = 3;
 
@@ -75,11 +78,11 @@ impl Models {
     ) -> Result<Self> {
         let (inputs, config, options) = (work.subject.inputs, work.subject.config, work.options);
         let streams = Streams::new(work.subject.seed).child("diagnosis/models");
-        let target = shared(inputs.target.rows.clone());
+        let target = Arc::new(inputs.target.rows.clone());
         let many = options.abundant / 2;
         // Other rows than those that are measured: a model must not be asked about what it was trained on.
         let generated = work.sampler.sample(many.max(own.len()), config.generator.y_max, "training")?.kept_rows();
-        let source = (inputs.source.as_ref()).map(|s| few(&s.rows, many.max(SOURCES_LEAST), &streams, "source rows"));
+        let source = (inputs.source.as_ref()).map(|s| few(&s.rows, many.max(FEWEST_SOURCES), &streams, "source rows"));
         let (mut at_source, mut at_generated, mut abundant) = (None, None, None);
         if let Some(place) = work.simulator {
             let wide = work.sampler.sample(many.max(own.len()), widest, "abundant")?.rows;
@@ -88,7 +91,7 @@ impl Models {
             if let Some(source) = &source {
                 all.extend(&under_target(place, source)?);
             }
-            abundant = Some(shared(all));
+            abundant = Some(Arc::new(all));
             at_source = sources.map(|s| under_target(place, &few(s, own.len(), &streams, "at source"))).transpose()?;
             at_generated = Some(under_target(place, &own.kept_rows())?);
         }
@@ -105,9 +108,9 @@ impl Models {
             members.len() - 1
         };
         let limited = ["limited 0", "limited 1", "limited 2"].map(|name| add(name, &target));
-        let generated = shared(generated);
+        let generated = Arc::new(generated);
         let of_generated = add("generated", &generated);
-        let of_source = source.map(|s| add("source", &shared(s)));
+        let of_source = source.map(|s| add("source", &Arc::new(s)));
         let of_abundant = abundant.as_ref().map(|a| add("abundant", a));
         let count = members.len();
         let mut checkpoints = attempt.checkpoints("transition-models")?;
@@ -211,6 +214,3 @@ impl Models {
         own.iter().zip(mean).map(|(a, b)| (a - b).abs()).collect()
     }
 }
-
-/// Fewer source rows than this make no model.
-const SOURCES_LEAST: usize = 1000;
