@@ -119,7 +119,8 @@ mod tests {
         for (found, expected) in found.iter().zip([5.0, 4.9, 4.0, 3.8, 3.8]) {
             assert!((found - expected).abs() < 1e-6);
         }
-        assert_eq!(distances_between_episodes(&rows, 1, &[0..5]).unwrap(), None);
+        let one = std::slice::from_ref(&(0..5));
+        assert_eq!(distances_between_episodes(&rows, 1, one).unwrap(), None);
     }
 
     proptest! {

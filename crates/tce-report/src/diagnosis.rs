@@ -9,7 +9,7 @@ use tce_diagnosis::memorisation::COPIES;
 use tce_diagnosis::{AtBound, Bounds, Curve, Diagnosis, Embedding, Group, Reliability, Spread};
 
 use crate::analysis::Analysis;
-use crate::html::{decades, document};
+use crate::html::{counted, decades, document};
 use crate::study::{Study, order, short};
 use crate::svg::{self, Axis, Cloud, Frame, Line, Point, Series, Steps, minus};
 
@@ -412,7 +412,7 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
                             td { (list(choices.iter().map(|c| number(c.generated_alone)).collect())) }
                             td { (list(choices.iter().map(|c| number(c.least_bound)).collect())) }
                             td class="edge text" {
-                                (list(mixed.iter().map(|m| format!("{} {}: {} ({} seeds)", m.title, plain(m.lambda), minus(format!("{:.1}", m.score)), m.seeds)).collect()))
+                                (list(mixed.iter().map(|m| format!("{} {}: {} ({})", m.title, plain(m.lambda), minus(format!("{:.1}", m.score)), counted(m.seeds, "seed", "seeds"))).collect()))
                             }
                             td class="text" { @match best { Some(m) => { "λ = " (plain(m.lambda)) ", " (m.title) }, None => "–" } }
                         }

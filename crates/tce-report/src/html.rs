@@ -86,7 +86,7 @@ fn said(e: &Estimate, decimals: usize) -> String {
     format!("{} {}", minus(format!("{:.decimals$}", e.point)), range(e.interval, decimals)).trim_end().to_owned()
 }
 
-fn counted(n: usize, one: &str, many: &str) -> String {
+pub(crate) fn counted(n: usize, one: &str, many: &str) -> String {
     if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
 }
 
