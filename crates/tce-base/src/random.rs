@@ -67,6 +67,16 @@ pub fn fill_uniform(rng: &mut Rng, out: &mut [f32]) {
     }
 }
 
+/// `count` of the numbers below `len` at random, ascending; all of them, without a draw, where there are no more.
+pub fn choose(rng: &mut Rng, len: usize, count: usize) -> Vec<usize> {
+    if count >= len {
+        return (0..len).collect();
+    }
+    let mut chosen = rand::seq::index::sample(rng, len, count).into_vec();
+    chosen.sort_unstable();
+    chosen
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,6 +89,15 @@ mod tests {
         assert_ne!(draw(1, "reset", 0), draw(2, "reset", 0));
         assert_ne!(draw(1, "reset", 0), draw(1, "action", 0));
         assert_ne!(draw(1, "reset", 0), draw(1, "reset", 1));
+    }
+
+    #[test]
+    fn chosen_numbers_ascend_without_repetition() {
+        let rng = || Streams::new(5).stream("choose");
+        let chosen = choose(&mut rng(), 50, 20);
+        assert!(chosen.len() == 20 && chosen[19] < 50 && chosen.windows(2).all(|w| w[0] < w[1]), "{chosen:?}");
+        assert_eq!(chosen, choose(&mut rng(), 50, 20));
+        assert_eq!(choose(&mut rng(), 3, 9), [0, 1, 2]);
     }
 
     #[test]

@@ -24,6 +24,7 @@
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
+use tce_base::random::choose;
 
 use crate::neighbours::Units;
 use crate::{DataError, NeighbourOptions, Rows, nn_distances};
@@ -175,9 +176,7 @@ impl Reference {
         if n <= options.reference {
             return Self { points: Vec::new(), indices: None };
         }
-        let mut rng = streams.stream("density/reference");
-        let mut indices = rand::seq::index::sample(&mut rng, n, options.reference).into_vec();
-        indices.sort_unstable();
+        let indices = choose(&mut streams.stream("density/reference"), n, options.reference);
         let mut points = vec![0.0; indices.len() * source.dim()];
         points.chunks_exact_mut(source.dim()).zip(&indices).for_each(|(point, &i)| source.copy_row(i, point));
         Self { points, indices: Some(indices) }

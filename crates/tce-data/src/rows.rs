@@ -72,6 +72,13 @@ impl<'a> Rows<'a> {
             self.copy_row(i, row);
         }
     }
+
+    /// All rows, copied together: `[len, dim]`.
+    pub fn to_vec(&self) -> Vec<f32> {
+        let mut out = vec![0.0; self.len * self.dim];
+        self.copy_rows(0..self.len, &mut out);
+        out
+    }
 }
 
 #[cfg(test)]
@@ -85,5 +92,6 @@ mod tests {
         let mut out = [0.0; 6];
         rows.copy_rows(1..3, &mut out);
         assert_eq!(out, [3.0, 4.0, 20.0, 5.0, 6.0, 30.0]);
+        assert_eq!(rows.to_vec(), [1.0, 2.0, 10.0, 3.0, 4.0, 20.0, 5.0, 6.0, 30.0]);
     }
 }

@@ -282,6 +282,15 @@ impl Buffer {
         out
     }
 
+    /// The spread of the steps s' - s of the member's part 0, in the units of [`Buffer::network_inputs`].
+    pub(crate) fn step_units(&self, member: usize) -> Standardizer {
+        let rows = &self.members[member].parts[0];
+        let mut steps = self.network_inputs(member, &rows.next_observations);
+        let states = self.network_inputs(member, &rows.observations);
+        steps.iter_mut().zip(states).for_each(|(step, s)| *step -= s);
+        Standardizer::fit(&steps, self.inputs.len())
+    }
+
     /// Appends an observation of `member` as its networks see it.
     pub(crate) fn push(&self, member: &Member, row: &[f32], out: &mut Vec<f32>) {
         let z = &member.standardizer;

@@ -20,7 +20,7 @@ use std::sync::Arc;
 
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
-use tce_data::{Standardizer, Transitions};
+use tce_data::{Rows, Standardizer, Transitions};
 use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError};
 
 use crate::buffer::{Buffer, Member, Minibatch};
@@ -264,7 +264,7 @@ pub fn train_labels(
 
 /// Rows (s, s').
 fn pairs(s: &[f32], s2: &[f32], dim: usize) -> Vec<f32> {
-    s.chunks(dim).zip(s2.chunks(dim)).flat_map(|(s, s2)| [s, s2].concat()).collect()
+    Rows::join(&[(s, dim), (s2, dim)]).to_vec()
 }
 
 fn rmse(predicted: &[f32], actual: &[f32]) -> f64 {

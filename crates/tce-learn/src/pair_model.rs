@@ -149,15 +149,11 @@ impl PairModel {
         let p = members.len();
         let (mut delta_mean, mut delta_std, mut mean, mut std) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for (m, member) in buffer.members().iter().enumerate() {
-            let rows = &member.parts[0];
-            let (s, s2) =
-                (buffer.network_inputs(m, &rows.observations), buffer.network_inputs(m, &rows.next_observations));
-            let delta: Vec<f32> = s2.iter().zip(&s).map(|(s2, s)| s2 - s).collect();
-            let delta = Standardizer::fit(&delta, inputs);
+            let delta = buffer.step_units(m);
             delta_mean.extend(delta.mean);
             delta_std.extend(delta.std);
             let reward = match target {
-                PairTarget::Reward => Standardizer::fit_on(&[Rows::new(&rows.rewards, 1)]),
+                PairTarget::Reward => Standardizer::fit_on(&[Rows::new(&member.parts[0].rewards, 1)]),
                 _ => Standardizer::identity(1),
             };
             mean.extend(reward.mean);

@@ -18,7 +18,7 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use tce_data::Standardizer;
+use tce_data::{Rows, Standardizer};
 use tce_nn::burn::tensor::activation::softplus;
 use tce_nn::{
     Checkpoints, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, tensor,
@@ -86,13 +86,7 @@ impl TransitionModel {
             return Err(LearnError::invalid(format!("member {m}, standardizer"), "another one", expected, "share one"));
         }
         let buffer = Buffer::new(members, config.batch)?.with_stream("transition batch");
-        let rows = &buffer.members()[0].parts[0];
-        let steps = |t: &tce_data::Transitions| -> Vec<f32> {
-            let (s, s2) = (buffer.network_inputs(0, &t.observations), buffer.network_inputs(0, &t.next_observations));
-            s2.iter().zip(&s).map(|(s2, s)| s2 - s).collect()
-        };
-        let d = buffer.inputs().len();
-        let units = Standardizer::fit(&steps(rows), d);
+        let (d, units) = (buffer.inputs().len(), buffer.step_units(0));
         let net = MlpConfig::relu(d + buffer.act_dim(), &config.hidden, 2 * d);
         let net = net.init(&buffer.streams(), "transition model", &device.clone().autodiff());
         Ok(Self { config: config.clone(), net: Trained::new(net), buffer, units, device: device.clone() })
@@ -123,8 +117,7 @@ impl TransitionModel {
     pub fn densities(&self, tables: &[(&[f32], &[f32])]) -> Vec<Densities> {
         let (d, a) = (self.buffer.inputs().len(), self.buffer.act_dim());
         let inputs = |(m, (s, actions)): (usize, &(&[f32], &[f32]))| -> Vec<f32> {
-            let s = self.buffer.network_inputs(m, s);
-            s.chunks_exact(d).zip(actions.chunks_exact(a)).flat_map(|(s, a)| [s, a].concat()).collect()
+            Rows::join(&[(&self.buffer.network_inputs(m, s), d), (actions, a)]).to_vec()
         };
         let tables: Vec<_> = tables.iter().enumerate().map(inputs).collect();
         let net = self.net.net().valid();

@@ -317,12 +317,11 @@ fn table(d: &Diagnosis) -> Markup {
         rows.push(("Generated rows that it rejects", percent(at.rejected)));
     }
     if let Some(b) = &d.theorem {
-        for (name, curve) in [("the simulator", b.value.as_ref()), ("the data alone", b.value_alone.as_ref())] {
+        for (text, curve) in [
+            ("|ΔV| of generated / nearest 2.5 % / all source rows, by the simulator", &b.value),
+            ("|ΔV| of generated / nearest 2.5 % / all source rows, by the data alone", &b.value_alone),
+        ] {
             let Some(c) = curve else { continue };
-            let text = match name {
-                "the simulator" => "|ΔV| of generated / nearest 2.5 % / all source rows, by the simulator",
-                _ => "|ΔV| of generated / nearest 2.5 % / all source rows, by the data alone",
-            };
             let all = c.all.last().copied().unwrap_or(f64::NAN);
             rows.push((text, format!("{} / {} / {}", number(c.generated), number(c.source[1]), number(all))));
         }

@@ -15,6 +15,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 use tce_base::Streams;
+use tce_base::random::choose;
 use tce_data::{
     NeighbourOptions, Rows, Transitions, TransportOptions, lambda_quantile_select, nn_distances, transport_costs,
 };
@@ -110,9 +111,7 @@ fn subset(rows: &Extra, n: usize, streams: Streams, name: &str) -> Extra {
     if n >= rows.rows.len() {
         return rows.clone();
     }
-    let mut indices = rand::seq::index::sample(&mut streams.stream(name), rows.rows.len(), n).into_vec();
-    indices.sort_unstable();
-    select(&rows.rows, rows.scores.as_deref(), &indices)
+    select(&rows.rows, rows.scores.as_deref(), &choose(&mut streams.stream(name), rows.rows.len(), n))
 }
 
 #[derive(Serialize)]

@@ -109,10 +109,14 @@ impl Film {
         self.panels.iter().map(|panel| &panel.recording)
     }
 
-    /// The steps that are shown of the longest episode.
+    /// The steps of the longest episode.
+    pub fn longest(&self) -> usize {
+        self.recordings().map(Recording::length).max().expect("a recording")
+    }
+
+    /// The steps that are shown of it.
     pub fn steps(&self) -> usize {
-        let longest = self.recordings().map(Recording::length).max().expect("a recording");
-        longest.min((self.frames - 1) * self.stride)
+        self.longest().min((self.frames - 1) * self.stride)
     }
 
     /// Width and height of a picture, pixels.

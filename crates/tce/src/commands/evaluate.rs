@@ -160,7 +160,7 @@ impl Evaluate {
         let file = self.video.as_ref().expect("there is a studio").path().to_owned();
         let [width, height] = film.size();
         let frames = film.frames();
-        let longest = film.recordings().map(Recording::length).max().expect("a panel");
+        let longest = film.longest();
         let mut note = format!(
             "{}: {frames} frames of {width}x{height}, {:.1} s, {:.1} MB",
             file.display(),

@@ -2,13 +2,14 @@
 
 use std::path::Path;
 
-use rand::seq::index;
 use tce_base::Streams;
+use tce_base::random::choose;
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation,
     Reliability, Sampled, Spread, coverage, gaussian, memorisation,
 };
+use tce_learn::Densities;
 use tce_nn::Device;
 
 use super::models::Models;
@@ -92,9 +93,10 @@ impl Work<'_> {
         };
         let covered_by_target = covered(&self.units().states(&target.observations))?;
         let distances = self.distances_to_real(&batches)?;
+        let step = generator::step_std(target, &self.units().live);
         let mut bounds_of_y = Vec::new();
         for ((&y, batch), distances) in grid.iter().zip(&batches).zip(&distances) {
-            let figures = Figures::of(batch, distances, &models, self)?;
+            let figures = Figures::of(batch, distances, &models, &step, &self.units().live)?;
             bounds_of_y.push(AtBound {
                 y_max: decimal(y),
                 coverage: covered(&batch.kept_states(self.units()))?,
@@ -148,9 +150,7 @@ impl Work<'_> {
         let mut order: Vec<usize> = (0..all.len()).collect();
         order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]).then(a.cmp(&b)));
         let pick = |from: &[usize], name: &str| {
-            let count = SOURCES.min(from.len());
-            let mut places = index::sample(&mut streams.stream(name), from.len(), count).into_vec();
-            places.sort_unstable();
+            let places = choose(&mut streams.stream(name), from.len(), SOURCES);
             all.select(&places.into_iter().map(|i| from[i]).collect::<Vec<_>>())
         };
         let share =
@@ -274,13 +274,14 @@ impl Work<'_> {
     fn theorem(&self, sources: &Sources, own: &Batch, models: &Models, streams: &Streams) -> Result<Bounds> {
         let Subject { inputs, config, .. } = *self.subject;
         let generated = own.kept_rows();
+        let of_sources = models.densities(&sources.sorted.observations, &sources.sorted.actions);
+        let of_generated = models.densities(&generated.observations, &generated.actions);
         let tv = |truth: usize| -> Option<Curve> {
-            let against = |t: &Transitions, own: Option<usize>| -> Option<Vec<f64>> {
-                let densities = models.densities(&t.observations, &t.actions);
-                let (p, q) = (&densities[own?], &densities[truth]);
-                Some(gaussian::total_variation(models.normals(p), models.normals(q), streams))
+            let against = |densities: &[Densities], own: usize| {
+                let [p, q] = [own, truth].map(|member| models.normals(&densities[member]));
+                gaussian::total_variation(p, q, streams)
             };
-            Curve::of(&against(&sources.sorted, models.source)?, &against(&generated, Some(models.generated))?)
+            Curve::of(&against(&of_sources, models.source?), &against(&of_generated, models.generated))
         };
         let transition = models.abundant.and_then(tv);
         let value = match self.simulator {
@@ -293,14 +294,14 @@ impl Work<'_> {
                 Curve::of(&gap(&sources.sorted)?, &gap(&generated)?)
             }
         };
-        let alone = |t: &Transitions| models.value_gap_alone(t, inputs.agent);
+        let alone = |t: &Transitions, densities: &[Densities]| models.value_gap_alone(t, densities, inputs.agent);
         Ok(Bounds {
             discount: config.learner.iql.discount,
             r_max: inputs.target.rows.rewards.iter().fold(0.0, |m, r| f64::from(r.abs()).max(m)),
             transition,
             value,
             transition_alone: tv(models.limited[0]),
-            value_alone: Curve::of(&alone(&sources.sorted), &alone(&generated)),
+            value_alone: Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated)),
         })
     }
 }
@@ -315,7 +316,8 @@ struct Figures {
 }
 
 impl Figures {
-    fn of(batch: &Batch, distances: &[f32], models: &Models, work: &Work) -> Result<Self> {
+    /// `step` is the spread of the target's steps in the dimensions `live`.
+    fn of(batch: &Batch, distances: &[f32], models: &Models, step: &[f32], live: &[usize]) -> Result<Self> {
         let t = &batch.rows;
         let kl = |abundant: usize| {
             let densities = models.densities(&t.observations, &t.actions);
@@ -323,15 +325,13 @@ impl Figures {
             gaussian::kl(p, q).into_iter().map(|v| v / p.dim as f64).collect()
         };
         let difference = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).collect();
-        let units = work.units();
-        let step = generator::step_std(&work.subject.inputs.target.rows, &units.live);
         Ok(Self {
             distance: distances.iter().map(|d| f64::from(*d)).collect(),
             transition_kl: models.abundant.map(kl),
             reward_difference: models.abundant_rewards(t)?.map(|r| difference(&t.rewards, &r)),
             reward_error: batch.simulated.as_ref().map(|s| difference(&t.rewards, &s.rewards)),
             consistency: (batch.simulated.as_ref())
-                .map(|s| generator::step_errors(&s.next_observations, t, &step, &units.live)),
+                .map(|s| generator::step_errors(&s.next_observations, t, step, live)),
         })
     }
 
@@ -355,16 +355,14 @@ pub fn few(t: &Transitions, count: usize, streams: &Streams, name: &str) -> Tran
     if t.len() <= count {
         return t.clone();
     }
-    let mut rows = index::sample(&mut streams.stream(name), t.len(), count).into_vec();
-    rows.sort_unstable();
-    t.select(&rows)
+    t.select(&choose(&mut streams.stream(name), t.len(), count))
 }
 
 /// (s, s') of live dimensions in units of the states, `[N, 2 d]`.
 fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
     let d = units.live.len();
     let (s, s2) = (units.states(&t.observations), units.states(&t.next_observations));
-    s.chunks_exact(d).zip(s2.chunks_exact(d)).flat_map(|(s, s2)| [s, s2].concat()).collect()
+    Rows::join(&[(&s, d), (&s2, d)]).to_vec()
 }
 
 /// As it is written: .1 and not .10000000149.

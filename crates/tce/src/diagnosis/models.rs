@@ -199,10 +199,9 @@ impl Models {
         own.iter().zip(other).map(|(a, b)| (a - b).abs()).collect()
     }
 
-    /// The same with the truth as the limited models see it: their mean of V at their mean successors.
-    pub fn value_gap_alone(&self, t: &Transitions, agent: Option<Agent>) -> Vec<f64> {
+    /// The same with the truth as the limited models see it: their mean of V at their mean successors. `densities` are those of `t`.
+    pub fn value_gap_alone(&self, t: &Transitions, densities: &[Densities], agent: Option<Agent>) -> Vec<f64> {
         let own = self.values(&t.next_observations, &t.terminals);
-        let densities = self.densities(&t.observations, &t.actions);
         let mut mean = vec![0.0; t.len()];
         for &m in &self.limited {
             let next = self.transition.next_observations(&t.observations, &densities[m]);
