@@ -9,14 +9,96 @@
 //! not depend on λ) or the λ share nearest to the target (Eq. 9; d grows with λ). The expectations are over the rows of the
 //! mixture, which stand for ρ_mix.
 //!
-//! **The rule.** TCE leaves λ to the user: OG (λ = 0) ... NN. [`Choice::of`] takes the λ with the least bound, where the bound is measured by
-//! models of the target rows alone, so that no environment is needed; and because the curve has noise, the smallest λ from which
-//! the least bound is no more than one standard error of the difference away (after the rule of Breiman et al. 1984).
+//! **The rule.** TCE leaves λ to the user: OG (λ = 0) ... NN. [`Choice::of`] takes the λ with the least bound, where d is measured by
+//! models of the target rows alone, so that no environment is needed. Such a d is the row's distance from what a *model* says, and
+//! the model is wrong too, most of all where the target has no rows: at the source's. With u an estimate of the model's own error,
+//! the triangle inequality leaves d − u ... d + u for the true distance. Between the λ of places a < b of the grid the bounds
+//! differ by
+//!
+//! ```text
+//! bound(b) − bound(a) = (b − a) (d_between − d_generated)        d_between: rows nearer than b and not than a
+//! ± (b − a) (u_between + u_generated + √(se²_between + se²_generated))
+//! ```
+//!
+//! and only a difference beyond its ± is told. The rule takes the smallest λ whose bound is not told from the least one; where that
+//! is 0, and not every other λ is told to be worse, the data do not say, and 0 stands as the paper's default.
 
 use serde::{Deserialize, Serialize};
 
 /// The λ at which curves are computed.
 pub const GRID: [f64; 10] = [0.0, 0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0];
+
+/// One discrepancy per row, and how wrong it may be.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rated {
+    /// d
+    pub gap: Vec<f64>,
+    /// u of the same rows.
+    pub doubt: Vec<f64>,
+}
+
+impl Rated {
+    /// Without a doubt, as the simulator rates.
+    pub fn certain(gap: Vec<f64>) -> Self {
+        Self { doubt: vec![0.0; gap.len()], gap }
+    }
+
+    /// The rows whose numbers are finite.
+    fn finite(&self) -> Self {
+        let rows = self.gap.iter().zip(&self.doubt).filter(|(d, u)| d.is_finite() && u.is_finite());
+        let (gap, doubt) = rows.unzip();
+        Self { gap, doubt }
+    }
+}
+
+/// What is known of the mean discrepancy of some rows. Parts of a whole add up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Part {
+    /// Rows.
+    pub rows: usize,
+    /// Σ d
+    pub sum: f64,
+    /// Σ d²
+    pub squares: f64,
+    /// Σ u
+    pub doubt: f64,
+}
+
+impl Part {
+    fn of(gap: &[f64], doubt: &[f64]) -> Self {
+        Self {
+            rows: gap.len(),
+            sum: gap.iter().sum(),
+            squares: gap.iter().map(|d| d * d).sum(),
+            doubt: doubt.iter().sum(),
+        }
+    }
+
+    fn and(self, other: &Self) -> Self {
+        Self {
+            rows: self.rows + other.rows,
+            sum: self.sum + other.sum,
+            squares: self.squares + other.squares,
+            doubt: self.doubt + other.doubt,
+        }
+    }
+
+    /// Mean d; NaN without rows.
+    pub fn mean(&self) -> f64 {
+        self.sum / self.rows as f64
+    }
+
+    /// Mean u; NaN without rows.
+    pub fn mean_doubt(&self) -> f64 {
+        self.doubt / self.rows as f64
+    }
+
+    /// The square of the standard error of the mean.
+    fn error_squared(&self) -> f64 {
+        let (n, mean) = (self.rows as f64, self.mean());
+        ((self.squares / n - mean * mean).max(0.0)) / (n - 1.0).max(1.0)
+    }
+}
 
 /// λ d_source(λ) + (1 − λ) d_generated for every λ of [`GRID`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,58 +107,63 @@ pub struct Curve {
     pub nearest: Vec<f64>,
     /// With source rows as they come.
     pub all: Vec<f64>,
-    /// d of the nearest share alone, NaN (null) at λ = 0.
-    #[serde(deserialize_with = "numbers")]
-    pub source: Vec<f64>,
-    /// Standard errors of `source`, 0 at λ = 0.
-    pub source_error: Vec<f64>,
-    /// d_generated
-    pub generated: f64,
-    /// Its standard error.
-    pub generated_error: f64,
-}
-
-/// JSON has no NaN.
-fn numbers<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Vec<f64>, D::Error> {
-    let all = Vec::<Option<f64>>::deserialize(from)?;
-    Ok(all.into_iter().map(|v| v.unwrap_or(f64::NAN)).collect())
-}
-
-/// Mean and its standard error.
-fn mean(values: &[f64]) -> (f64, f64) {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-    (mean, (variance / n).sqrt())
+    /// The source rows between each λ of the grid and the one before; none at λ = 0.
+    pub parts: Vec<Part>,
+    /// The generated rows.
+    pub generated: Part,
+    /// Rows whose discrepancy is not a finite number, and which are left out: source and generated ones.
+    pub lost: (usize, usize),
 }
 
 impl Curve {
-    /// From one discrepancy per source row, nearest row first, and one per generated row. Rows whose discrepancy is not a finite number
-    /// are left out. None if nothing is left.
-    pub fn of(sources: &[f64], generated: &[f64]) -> Option<Self> {
-        let finite = |v: &[f64]| v.iter().copied().filter(|v| v.is_finite()).collect::<Vec<_>>();
-        let (sources, generated) = (finite(sources), finite(generated));
-        if sources.is_empty() || generated.is_empty() {
+    /// From ratings of the source rows, nearest row first, and of the generated rows. None if no finite ones are left.
+    pub fn of(sources: &Rated, generated: &Rated) -> Option<Self> {
+        let (s, g) = (sources.finite(), generated.finite());
+        if s.gap.is_empty() || g.gap.is_empty() {
             return None;
         }
-        let ((g, generated_error), (whole, _)) = (mean(&generated), mean(&sources));
-        let mut curve =
-            Self { nearest: vec![], all: vec![], source: vec![], source_error: vec![], generated: g, generated_error };
-        for lambda in GRID {
-            let share = ((lambda * sources.len() as f64).round() as usize).max(1);
-            let (d, error) = if lambda == 0.0 { (f64::NAN, 0.0) } else { mean(&sources[..share]) };
-            curve.source.push(d);
-            curve.source_error.push(error);
-            curve.nearest.push(if lambda == 0.0 { g } else { lambda * d + (1.0 - lambda) * g });
-            curve.all.push(lambda * whole + (1.0 - lambda) * g);
+        let lost = (sources.gap.len() - s.gap.len(), generated.gap.len() - g.gap.len());
+        let rows = |k: usize| ((GRID[k] * s.gap.len() as f64).round() as usize).max(k.min(1));
+        let part = |k: usize| {
+            let places = if k == 0 { 0..0 } else { rows(k - 1)..rows(k) };
+            Part::of(&s.gap[places.clone()], &s.doubt[places])
+        };
+        let mut curve = Self {
+            nearest: vec![],
+            all: vec![],
+            parts: (0..GRID.len()).map(part).collect(),
+            generated: Part::of(&g.gap, &g.doubt),
+            lost,
+        };
+        let (generated, whole) = (curve.generated.mean(), curve.source(GRID.len() - 1).mean());
+        for (k, lambda) in GRID.into_iter().enumerate() {
+            let own = if k == 0 { generated } else { lambda * curve.source(k).mean() + (1.0 - lambda) * generated };
+            curve.nearest.push(own);
+            curve.all.push(lambda * whole + (1.0 - lambda) * generated);
         }
         Some(curve)
     }
 
-    /// The standard error of the difference between `nearest` at two places of [`GRID`].
-    fn error_between(&self, a: usize, b: usize) -> f64 {
-        let part = |k: usize| (GRID[k] * self.source_error[k]).powi(2);
-        (((GRID[a] - GRID[b]) * self.generated_error).powi(2) + part(a) + part(b)).sqrt()
+    /// The source rows up to a place of [`GRID`].
+    pub fn source(&self, place: usize) -> Part {
+        self.between(0, place)
+    }
+
+    fn between(&self, a: usize, b: usize) -> Part {
+        self.parts[a + 1..=b].iter().fold(Part::default(), Part::and)
+    }
+
+    /// How far `nearest` at two places a < b of [`GRID`] has to differ for the difference to be told.
+    pub fn doubt_between(&self, a: usize, b: usize) -> f64 {
+        let (part, g) = (self.between(a, b), &self.generated);
+        // Two places may share their rows where there are few.
+        let (doubt, error) = if part.rows == 0 { (0.0, 0.0) } else { (part.mean_doubt(), part.error_squared()) };
+        (GRID[b] - GRID[a]) * (doubt + g.mean_doubt() + (error + g.error_squared()).sqrt())
+    }
+
+    /// Whether the bound at place `a` is told to be greater than the one at `b`.
+    fn told_worse(&self, a: usize, b: usize) -> bool {
+        self.nearest[a] - self.nearest[b] > self.doubt_between(a.min(b), a.max(b))
     }
 }
 
@@ -95,9 +182,16 @@ pub struct Bounds {
     pub transition_alone: Option<Curve>,
     /// See `transition_alone`; what the rule looks at.
     pub value_alone: Option<Curve>,
+    /// Mean d and u of target rows by models that did not see them: u is multiplied by their ratio if it is above 1.
+    pub held_out: Option<(f64, f64)>,
 }
 
 impl Bounds {
+    /// What u is multiplied by.
+    pub fn calibration(&self) -> f64 {
+        self.held_out.map_or(1.0, |(d, u)| if u > 0.0 { (d / u).max(1.0) } else { 1.0 })
+    }
+
     /// 2γ r_max / (1 − γ)²
     pub fn transition_factor(&self) -> f64 {
         2.0 * self.discount * self.r_max / (1.0 - self.discount).powi(2)
@@ -114,6 +208,8 @@ impl Bounds {
 pub struct Choice {
     /// The λ.
     pub lambda: f64,
+    /// Whether the data say so. If not, `lambda` is 0, the paper's default.
+    pub told: bool,
     /// The λ with the least bound.
     pub least: f64,
     /// The bound there, without its factor.
@@ -126,13 +222,13 @@ impl Choice {
     /// The rule.
     pub fn of(curve: &Curve) -> Self {
         let best = (0..GRID.len()).min_by(|&a, &b| curve.nearest[a].total_cmp(&curve.nearest[b])).expect("a grid");
-        let enough = |&k: &usize| curve.nearest[k] - curve.nearest[best] <= curve.error_between(k, best);
-        let chosen = (0..best).find(enough).unwrap_or(best);
+        let chosen = (0..best).find(|&k| !curve.told_worse(k, best)).unwrap_or(best);
         Self {
             lambda: GRID[chosen],
+            told: chosen > 0 || (1..GRID.len()).all(|k| curve.told_worse(k, 0)),
             least: GRID[best],
             least_bound: curve.nearest[best],
-            generated_alone: curve.generated,
+            generated_alone: curve.nearest[0],
         }
     }
 }
@@ -141,37 +237,72 @@ impl Choice {
 mod tests {
     use super::*;
 
+    fn curve(sources: &[f64], generated: &[f64]) -> Curve {
+        Curve::of(&Rated::certain(sources.to_vec()), &Rated::certain(generated.to_vec())).unwrap()
+    }
+
     #[test]
     fn the_curve_is_the_mixture_of_both_means() {
         // The nearest half of the source is at .1, the rest at 1.1.
         let sources: Vec<f64> = (0..1000).map(|i| if i < 500 { 0.1 } else { 1.1 }).chain([f64::NAN]).collect();
-        let curve = Curve::of(&sources, &[0.3, 0.5, f64::INFINITY]).unwrap();
-        assert!((curve.generated - 0.4).abs() < 1e-12);
+        let curve = curve(&sources, &[0.3, 0.5, f64::INFINITY]);
+        assert!((curve.generated.mean() - 0.4).abs() < 1e-12);
         let at = |lambda: f64| GRID.iter().position(|l| *l == lambda).unwrap();
-        assert!((curve.nearest[at(0.0)] - 0.4).abs() < 1e-12 && curve.source[0].is_nan());
+        assert!((curve.nearest[at(0.0)] - 0.4).abs() < 1e-12);
         assert!((curve.nearest[at(0.4)] - (0.4 * 0.1 + 0.6 * 0.4)).abs() < 1e-12);
         // At .8, 500 of 800 rows are at .1.
         let d = (500.0 * 0.1 + 300.0 * 1.1) / 800.0;
         assert!((curve.nearest[at(0.8)] - (0.8 * d + 0.2 * 0.4)).abs() < 1e-12);
         assert!((curve.all[at(0.4)] - (0.4 * 0.6 + 0.6 * 0.4)).abs() < 1e-12);
-        assert!((curve.generated_error - 0.1).abs() < 1e-12, "two rows at ±.1: {}", curve.generated_error);
-        assert_eq!(Curve::of(&[], &[1.0]), None);
+        assert_eq!((curve.lost, curve.parts.iter().map(|p| p.rows).sum::<usize>()), ((1, 1), 1000));
+        assert!((curve.generated.error_squared() - 0.01).abs() < 1e-12, "two rows at ±.1");
+        assert_eq!(Curve::of(&Rated::default(), &Rated::certain(vec![1.0])), None);
+    }
+
+    /// The ± of the module's words, on numbers worked by hand: between .4 and .6 lie 200 rows, half at 1 and half at 3.
+    #[test]
+    fn differences_are_doubted_by_the_rows_between() {
+        let gap: Vec<f64> = (0..1000).map(|i| if i % 2 == 0 { 1.0 } else { 3.0 }).collect();
+        let doubt: Vec<f64> = (0..1000).map(|i| if (400..600).contains(&i) { 0.5 } else { 9.0 }).collect();
+        let generated = Rated { gap: vec![4.0, 6.0], doubt: vec![0.1, 0.3] };
+        let curve = Curve::of(&Rated { gap, doubt }, &generated).unwrap();
+        let (se_between, se_generated) = (1.0 / 199f64.sqrt(), 1.0);
+        let expected = 0.2 * (0.5 + 0.2 + (se_between * se_between + se_generated * se_generated as f64).sqrt());
+        let at = |lambda: f64| GRID.iter().position(|l| *l == lambda).unwrap();
+        assert!((curve.doubt_between(at(0.4), at(0.6)) - expected).abs() < 1e-12);
+        assert!((curve.nearest[at(0.6)] - curve.nearest[at(0.4)] - 0.2 * (2.0 - 5.0)).abs() < 1e-12);
     }
 
     #[test]
-    fn the_rule_takes_generated_rows_unless_near_source_rows_are_better() {
+    fn the_rule_takes_generated_rows_unless_near_source_rows_are_told_to_be_better() {
         let generated: Vec<f64> = (0..1000).map(|i| 0.4 + 0.01 * f64::from(i % 2)).collect();
         let far = vec![2.0; 1000];
-        assert_eq!(Choice::of(&Curve::of(&far, &generated).unwrap()).lambda, 0.0);
+        let choice = Choice::of(&curve(&far, &generated));
+        assert_eq!((choice.lambda, choice.told), (0.0, true));
         // The nearest 30 % are as good as real ones, the others are not.
         let near: Vec<f64> = (0..1000).map(|i| if i < 300 { 0.01 } else { 3.0 }).collect();
-        let choice = Choice::of(&Curve::of(&near, &generated).unwrap());
-        assert_eq!((choice.lambda, choice.least), (0.3, 0.3));
-        // An advantage within the noise does not count.
+        let choice = Choice::of(&curve(&near, &generated));
+        assert_eq!((choice.lambda, choice.least, choice.told), (0.3, 0.3, true));
+        // An advantage within the noise does not count, and is said to be none.
         let noisy: Vec<f64> = (0..100).map(|i| if i % 2 == 0 { 0.0 } else { 0.8 }).collect();
-        let choice = Choice::of(&Curve::of(&[0.395; 100], &noisy).unwrap());
-        assert_eq!(choice.lambda, 0.0);
+        let choice = Choice::of(&curve(&[0.395; 100], &noisy));
+        assert_eq!((choice.lambda, choice.told), (0.0, false));
         assert!(choice.least > 0.0);
+    }
+
+    /// Models that guess at the source's rows do not decide between them and generated ones.
+    #[test]
+    fn what_models_guess_does_not_count() {
+        let generated = Rated { gap: vec![0.4; 1000], doubt: vec![0.3; 1000] };
+        let rated = |gap: f64, doubt: f64| {
+            Choice::of(&Curve::of(&Rated { gap: vec![gap; 1000], doubt: vec![doubt; 1000] }, &generated).unwrap())
+        };
+        assert_eq!((rated(160.0, 150.0).lambda, rated(160.0, 150.0).told), (0.0, true));
+        assert_eq!((rated(160.0, 165.0).lambda, rated(160.0, 165.0).told), (0.0, false));
+        assert_eq!((rated(0.2, 0.1).lambda, rated(0.2, 0.1).told), (0.0, false), "less than .4 in doubt");
+        let sure = Rated::certain(vec![0.4; 1000]);
+        let near = Curve::of(&Rated { gap: vec![0.2; 1000], doubt: vec![0.1; 1000] }, &sure).unwrap();
+        assert_eq!((Choice::of(&near).lambda, Choice::of(&near).told), (1.0, true));
     }
 
     #[test]
@@ -183,6 +314,7 @@ mod tests {
             value: None,
             transition_alone: None,
             value_alone: None,
+            held_out: None,
         };
         assert!((bounds.transition_factor() - 99_000.0).abs() < 1e-6);
         assert!((bounds.value_factor() - 99.0).abs() < 1e-9);

@@ -28,8 +28,10 @@ pub struct Diagnosis {
     pub rows: usize,
     /// Target rows.
     pub target_rows: usize,
-    /// Coverage by the target rows themselves: what there is without any expansion.
-    pub covered_by_target: Coverage,
+    /// States of each domain that coverage is counted over, and covering rows; those are no reference rows.
+    pub coverage_rows: usize,
+    /// Coverage by the target rows themselves: what there is without any expansion. None where rows are too few.
+    pub covered_by_target: Option<Coverage>,
     /// Figures over y_max, ascending.
     pub bounds_of_y: Vec<AtBound>,
     /// The rows as they are drawn under the run's own y_max.
@@ -38,16 +40,23 @@ pub struct Diagnosis {
     pub transitions: Option<Embedding>,
     /// Source, target and generated states in the plane (Fig. 3 a.1), by y_max.
     pub states: Vec<(f64, Embedding)>,
-    /// None for target data of a single episode.
-    pub memorisation: Option<Memorisation>,
     /// Inverse dynamics and reward model.
     pub labels: Labels,
     /// Theorem 1; None without source rows.
     pub theorem: Option<Bounds>,
     /// λ from the data alone.
     pub choice: Option<Choice>,
+    /// What the same rule says where the simulator measures, to judge `choice` by.
+    pub choice_by_simulator: Option<Choice>,
     /// What could not be measured, and why.
     pub notes: Vec<String>,
+}
+
+impl Diagnosis {
+    /// The figures at the run's own y_max.
+    pub fn at_own_bound(&self) -> Option<&AtBound> {
+        self.bounds_of_y.iter().find(|b| (b.y_max - self.y_max).abs() < 1e-9)
+    }
 }
 
 /// Figures at one y_max.
@@ -55,10 +64,14 @@ pub struct Diagnosis {
 pub struct AtBound {
     /// The label bound.
     pub y_max: f64,
-    /// Coverage by the rows that pass the filter.
-    pub coverage: Coverage,
-    /// Share of rows that the filter rejects.
+    /// Rows that hold a number that is not finite. They are part of no figure but `rejected`.
+    pub lost: usize,
+    /// Coverage by rows that pass the filter; None where too few do.
+    pub coverage: Option<Coverage>,
+    /// Share of rows that the filter rejects, lost ones among them.
     pub rejected: f64,
+    /// Whether rows that pass are copies; None where one episode has most of the target rows, or no row passes.
+    pub memorisation: Option<Memorisation>,
     /// Of rows that pass.
     pub kept: Reliability,
     /// Of rows that do not; None if there is none.

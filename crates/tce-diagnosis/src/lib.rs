@@ -18,9 +18,9 @@ pub mod gaussian;
 pub mod memorisation;
 mod numbers;
 
-pub use bounds::{Bounds, Choice, Curve};
+pub use bounds::{Bounds, Choice, Curve, Part, Rated};
 pub use coverage::Coverage;
 pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};
 pub use embedding::{Embedding, Group};
-pub use memorisation::Memorisation;
+pub use memorisation::{HeldOut, Memorisation, Verdict};
 pub use numbers::{Histogram, Spread};

@@ -2,51 +2,141 @@
 //!
 //! A sample of the right distribution is as far from the training rows as held-out rows are. As the test of Meehan et al. 2020 (A
 //! Non-Parametric Test to Detect Data-Copying in Generative Models) has it, the distances of both to their nearest training row are
-//! compared: p = P(d_generated < d_held-out) + ½ P(=), one half without copying, 1 for copies.
+//! compared: p = P(d_generated < d_held-out) + ½ P(=).
 //!
-//! Held-out rows without a held-out set: every training row against the rows of the *other* episodes. Within an episode, neighbours
-//! in time are nearly the same row.
+//! Held-out rows without a held-out set: for every episode e, its rows and a random share of the generated ones are measured against
+//! the *same* rows, the training rows T∖e of the other episodes (within an episode, neighbours in time are nearly the same row); p
+//! is the mean of the p_e, weighted by the rows of e. With w_e the share of rows in e:
+//!
+//! | rows | p |
+//! |---|---|
+//! | of the right distribution | ½ |
+//! | copies of T: the w_e copied from e are as far from T∖e as e is | 1 − ½ Σ w_e² |
+//! | beside the data | towards 0 |
+//!
+//! The measure needs episodes that visit the same states, as the gait of one policy does. Where every episode is a place of its own,
+//! fresh rows get the p of copies, and [`Memorisation::identical`] alone tells them apart.
 
 use std::ops::Range;
 
+use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
+use tce_base::Streams;
 use tce_data::{DataError, NeighbourOptions, Rows, nn_distances};
 
 use crate::numbers::Spread;
 
-/// Above this p generated rows are said to be copies: three of four lie nearer to a training row than a held-out row does.
-pub const COPIES: f64 = 0.75;
+/// Below this p generated rows are said to lie beside the data: three of four are farther from a training row than a held-out row is.
+pub const BESIDE: f64 = 0.25;
 
 /// How near generated rows are to training rows, beside rows that the generator did not see.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Memorisation {
     /// Distance of generated rows to the nearest training row.
     pub generated: Spread,
-    /// Distance of held-out rows to the nearest training row.
+    /// Distance of training rows to the nearest one of another episode.
     pub held_out: Spread,
     /// Share of generated rows that are a training row.
     pub identical: f64,
     /// p
     pub probability: f64,
+    /// What p would be if every row were copied.
+    pub of_copies: f64,
+}
+
+/// What p says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// Nearer to copies than to fresh rows.
+    Copies,
+    /// As far from the training rows as held-out rows are, roughly.
+    Fresh,
+    /// Farther from the training rows than held-out rows are.
+    Beside,
 }
 
 impl Memorisation {
-    /// From the distances of generated and held-out rows to their nearest training row; None where one has no finite ones.
-    pub fn of(generated: &[f32], held_out: &[f32]) -> Option<Self> {
-        let wide = |d: &[f32]| d.iter().map(|&d| f64::from(d)).collect::<Vec<_>>();
-        let (g, h) = (wide(generated), wide(held_out));
-        Some(Self {
-            generated: Spread::of(g.iter().copied())?,
-            held_out: Spread::of(h.iter().copied())?,
-            identical: g.iter().filter(|d| **d == 0.0).count() as f64 / g.len() as f64,
-            probability: probability_below(&g, h),
-        })
+    /// What p says: copies from half the way between ½ and what copies get, beside the data below [`BESIDE`].
+    pub fn verdict(&self) -> Verdict {
+        match self.probability {
+            p if p > (0.5 + self.of_copies) / 2.0 => Verdict::Copies,
+            p if p < BESIDE => Verdict::Beside,
+            _ => Verdict::Fresh,
+        }
+    }
+}
+
+/// Training rows with the distances of every episode to the others.
+pub struct HeldOut {
+    rows: Vec<f32>,
+    dim: usize,
+    episodes: Vec<Range<usize>>,
+    /// By episode, of its rows.
+    distances: Vec<Vec<f64>>,
+}
+
+impl HeldOut {
+    /// Of `rows`, row-major of width `dim`. None if an episode has more than half of the rows: too little is left to compare with.
+    ///
+    /// # Errors
+    /// If the user interrupts.
+    pub fn new(rows: Vec<f32>, dim: usize, episodes: Vec<Range<usize>>) -> Result<Option<Self>, DataError> {
+        let count = rows.len() / dim;
+        if episodes.is_empty() || episodes.iter().any(|e| 2 * e.len() > count) {
+            return Ok(None);
+        }
+        let mut held_out = Self { rows, dim, episodes, distances: Vec::new() };
+        for e in held_out.episodes.clone() {
+            let own = &held_out.rows[e.start * dim..e.end * dim];
+            held_out.distances.push(held_out.without(&e, own)?);
+        }
+        Ok(Some(held_out))
     }
 
-    /// Whether p says that rows were copied.
-    pub fn copied(&self) -> bool {
-        self.probability > COPIES
+    /// Distances of `rows` to the nearest training row outside of `episode`.
+    fn without(&self, episode: &Range<usize>, rows: &[f32]) -> Result<Vec<f64>, DataError> {
+        let others = [&self.rows[..episode.start * self.dim], &self.rows[episode.end * self.dim..]].concat();
+        nearest(rows, &others, self.dim)
     }
+
+    /// How near `generated` rows are; None if there are none.
+    ///
+    /// # Errors
+    /// If the user interrupts.
+    pub fn judge(&self, generated: &[f32], streams: &Streams) -> Result<Option<Memorisation>, DataError> {
+        let (dim, count) = (self.dim, generated.len() / self.dim);
+        let mut order: Vec<usize> = (0..count).collect();
+        order.shuffle(&mut streams.stream("shares of the episodes"));
+        let total: usize = self.episodes.iter().map(Range::len).sum();
+        let (mut above, mut weight, mut squares) = (0.0, 0.0, 0.0);
+        for (e, distances) in self.episodes.iter().zip(&self.distances) {
+            // Episodes follow one another: a share of the generated rows each, as large as theirs of the training rows.
+            let share = &order[e.start * count / total..e.end * count / total];
+            squares += (e.len() as f64 / total as f64).powi(2);
+            if share.is_empty() {
+                continue;
+            }
+            let rows: Vec<f32> = share.iter().flat_map(|&i| generated[i * dim..(i + 1) * dim].to_vec()).collect();
+            above += e.len() as f64 * probability_below(&self.without(e, &rows)?, distances.clone());
+            weight += e.len() as f64;
+        }
+        let to_all = nearest(generated, &self.rows, dim)?;
+        let identical = to_all.iter().filter(|d| **d == 0.0).count() as f64 / count as f64;
+        let spreads = Spread::of(to_all).zip(Spread::of(self.distances.iter().flatten().copied()));
+        Ok(spreads.map(|(generated, held_out)| Memorisation {
+            generated,
+            held_out,
+            identical,
+            probability: above / weight,
+            of_copies: 1.0 - squares / 2.0,
+        }))
+    }
+}
+
+fn nearest(rows: &[f32], among: &[f32], dim: usize) -> Result<Vec<f64>, DataError> {
+    let found = nn_distances(&Rows::new(rows, dim), &Rows::new(among, dim), &NeighbourOptions::default())?;
+    Ok(found.into_iter().map(f64::from).collect())
 }
 
 /// P(a < b) + ½ P(a = b) for one number of each set.
@@ -59,68 +149,70 @@ fn probability_below(a: &[f64], mut b: Vec<f64>) -> f64 {
     a.iter().map(|&x| above(x)).sum::<f64>() / (a.len() * b.len()) as f64
 }
 
-/// The distance of every row to the nearest row of another episode; None for a single episode.
-///
-/// # Errors
-/// If the user interrupts.
-pub fn distances_between_episodes(
-    rows: &[f32],
-    dim: usize,
-    episodes: &[Range<usize>],
-) -> Result<Option<Vec<f32>>, DataError> {
-    if episodes.len() < 2 {
-        return Ok(None);
-    }
-    let mut out = Vec::with_capacity(rows.len() / dim);
-    for own in episodes {
-        let inside = &rows[own.start * dim..own.end * dim];
-        let others = [&rows[..own.start * dim], &rows[own.end * dim..]].concat();
-        let options = NeighbourOptions::default();
-        out.extend(nn_distances(&Rows::new(inside, dim), &Rows::new(&others, dim), &options)?);
-    }
-    Ok(Some(out))
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use tce_base::{Streams, random::fill_normal};
+    use tce_base::random::fill_normal;
 
     use super::*;
 
-    fn cloud(name: &str, rows: usize) -> Vec<f32> {
-        let mut out = vec![0.0; rows * 4];
+    /// Episodes are clusters: rows of one lie around its own centre.
+    fn episodes(name: &str, centres: &[f32], rows: usize) -> Vec<f32> {
+        let mut out = vec![0.0; centres.len() * rows * 4];
         fill_normal(&mut Streams::new(3).stream(name), &mut out);
+        for (rows, centre) in out.chunks_exact_mut(rows * 4).zip(centres) {
+            rows.iter_mut().for_each(|x| *x += centre);
+        }
         out
     }
 
-    fn to_training(rows: &[f32], training: &[f32]) -> Vec<f32> {
-        nn_distances(&Rows::new(rows, 4), &Rows::new(training, 4), &NeighbourOptions::default()).unwrap()
+    fn judge(training: &[f32], generated: &[f32], episodes: usize) -> Memorisation {
+        let each = training.len() / 4 / episodes;
+        let ranges = (0..episodes).map(|e| e * each..(e + 1) * each).collect();
+        let held_out = HeldOut::new(training.to_vec(), 4, ranges).unwrap().unwrap();
+        held_out.judge(generated, &Streams::new(1)).unwrap().unwrap()
     }
 
     #[test]
-    fn copies_are_flagged_and_fresh_rows_are_not() {
-        let (training, held_out) = (cloud("training", 1000), cloud("held out", 1000));
-        let held_out = to_training(&held_out, &training);
-        let copies = Memorisation::of(&to_training(&training[..2000], &training), &held_out).unwrap();
-        assert!(copies.copied() && copies.probability == 1.0 && copies.identical == 1.0);
-        let mut near = training.clone();
-        near.iter_mut().zip(cloud("noise", 1000)).for_each(|(x, z)| *x += 0.05 * z);
-        let near = Memorisation::of(&to_training(&near, &training), &held_out).unwrap();
-        assert!(near.copied() && near.identical == 0.0, "{near:?}");
-        let fresh = Memorisation::of(&to_training(&cloud("fresh", 1000), &training), &held_out).unwrap();
-        assert!(!fresh.copied() && (fresh.probability - 0.5).abs() < 0.04, "{fresh:?}");
+    fn copies_fresh_rows_and_rows_beside_the_data_are_told_apart() {
+        for count in [2, 3, 5, 50] {
+            let centres = vec![0.0; count];
+            let training = episodes("training", &centres, 1000 / count);
+            let copies = judge(&training, &training, count);
+            assert_eq!((copies.verdict(), copies.identical), (Verdict::Copies, 1.0), "{count} episodes: {copies:?}");
+            assert!((copies.probability - copies.of_copies).abs() < 0.03, "{count} episodes: {copies:?}");
+            let mut near = training.clone();
+            near.iter_mut().zip(episodes("noise", &centres, 1000 / count)).for_each(|(x, z)| *x += 0.05 * z);
+            let near = judge(&training, &near, count);
+            assert_eq!((near.verdict(), near.identical), (Verdict::Copies, 0.0), "{count} episodes: {near:?}");
+            // A perfect generator, however few the episodes are.
+            let fresh = judge(&training, &episodes("fresh", &centres, 2000 / count), count);
+            assert!(fresh.verdict() == Verdict::Fresh && (fresh.probability - 0.5).abs() < 0.05, "{count}: {fresh:?}");
+            let far: Vec<f32> = training.iter().map(|x| 3.0 * x + 2.0).collect();
+            assert_eq!(judge(&training, &far, count).verdict(), Verdict::Beside, "{count} episodes");
+        }
+    }
+
+    /// The limit of the measure: where every episode is a place of its own, rows of the others' places look like copies. What is left
+    /// to tell them by is how many are identical.
+    #[test]
+    fn episodes_apart_from_each_other_cannot_be_judged_by_p() {
+        let centres = [0.0, 30.0, 60.0, 90.0, 120.0];
+        let training = episodes("training", &centres, 200);
+        let fresh = judge(&training, &episodes("fresh", &centres, 400), 5);
+        assert!(fresh.identical == 0.0 && fresh.verdict() == Verdict::Copies, "{fresh:?}");
     }
 
     #[test]
     fn only_other_episodes_count() {
-        let rows = [0.0, 0.1, 5.0, 5.2, 9.0f32];
-        let found = distances_between_episodes(&rows, 1, &[0..2, 2..4, 4..5]).unwrap().unwrap();
-        for (found, expected) in found.iter().zip([5.0, 4.9, 4.0, 3.8, 3.8]) {
+        let rows = vec![0.0, 0.1, 5.0, 5.2, 9.0f32];
+        let held_out = HeldOut::new(rows.clone(), 1, vec![0..2, 2..4, 4..5]).unwrap().unwrap();
+        for (found, expected) in held_out.distances.concat().iter().zip([5.0, 4.9, 4.0, 3.8, 3.8]) {
             assert!((found - expected).abs() < 1e-6);
         }
-        let one = std::slice::from_ref(&(0..5));
-        assert_eq!(distances_between_episodes(&rows, 1, one).unwrap(), None);
+        assert!(HeldOut::new(rows.clone(), 1, vec![0..5]).unwrap().is_none());
+        assert!(HeldOut::new(rows, 1, vec![0..3, 3..5]).unwrap().is_none(), "two rows are too few to compare with");
+        assert!(held_out.judge(&[], &Streams::new(0)).unwrap().is_none());
     }
 
     proptest! {

@@ -5,8 +5,10 @@ use maud::{Markup, html};
 use tce_data::Task;
 use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::coverage::NEIGHBOUR;
-use tce_diagnosis::memorisation::COPIES;
-use tce_diagnosis::{AtBound, Bounds, Curve, Diagnosis, Embedding, Group, Reliability, Spread};
+use tce_diagnosis::memorisation::BESIDE;
+use tce_diagnosis::{
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread, Verdict,
+};
 
 use crate::analysis::Analysis;
 use crate::html::{counted, decades, document};
@@ -73,15 +75,18 @@ fn lede(d: &Diagnosis) -> String {
     let at = |y: f64| d.bounds_of_y.iter().find(|b| (b.y_max - y).abs() < 1e-9);
     let mut text = String::new();
     if let (Some(zero), Some(own)) = (at(0.0), at(d.y_max)) {
+        let target = |c: Option<Coverage>| c.map_or("–".into(), |c| percent(c.target));
+        let source = |c: Option<Coverage>| c.and_then(|c| c.source).map_or("–".into(), percent);
         text += &format!(
-            "With y_max = {} generated rows cover {} of the target's and {} of the source's states ({} and {} at y_max = 0; the target \
-             rows themselves {} of the source's).",
+            "With y_max = {} generated rows cover {} of the target's and {} of the source's states ({} and {} at y_max = 0; as many \
+             target rows {} and {}).",
             plain(d.y_max),
-            percent(own.coverage.target),
-            own.coverage.source.map_or("–".into(), percent),
-            percent(zero.coverage.target),
-            zero.coverage.source.map_or("–".into(), percent),
-            d.covered_by_target.source.map_or("–".into(), percent),
+            target(own.coverage),
+            source(own.coverage),
+            target(zero.coverage),
+            source(zero.coverage),
+            target(d.covered_by_target),
+            source(d.covered_by_target),
         );
         if let Some(c) = own.kept.consistency {
             text += &format!(
@@ -90,20 +95,33 @@ fn lede(d: &Diagnosis) -> String {
             );
         }
     }
-    if let Some(m) = &d.memorisation {
-        text += if m.copied() {
-            " They look like copies of training rows."
-        } else {
-            " They are no copies of training rows."
-        };
+    if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
+        text += &format!(" {}.", verdict(m.verdict()));
     }
     if let Some(c) = &d.choice {
-        text += &match c.lambda {
-            0.0 => " The data alone say: λ = 0, generated rows without source rows.".to_owned(),
-            l => format!(" The data alone say: λ = {}, with the nearest source rows.", plain(l)),
+        text += &match c {
+            Choice { told: false, .. } => {
+                " The data alone do not say which λ is best: models of the target rows are too much in doubt."
+                    .to_owned()
+            }
+            Choice { lambda: 0.0, .. } => " The data alone say: λ = 0, generated rows without source rows.".to_owned(),
+            c => format!(" The data alone say: λ = {}, with the nearest source rows.", plain(c.lambda)),
         };
     }
     text
+}
+
+fn verdict(v: Verdict) -> &'static str {
+    match v {
+        Verdict::Copies => "They look like copies of training rows",
+        Verdict::Fresh => "They are no copies of training rows",
+        Verdict::Beside => "They are no copies, but lie farther from the training rows than held-out rows do",
+    }
+}
+
+/// A choice of the rule in a cell.
+fn chosen(c: &Choice) -> String {
+    if c.told { plain(c.lambda) } else { format!("cannot tell ({} by default)", plain(c.lambda)) }
 }
 
 fn class(title: &str, class: &str) -> Series {
@@ -139,7 +157,7 @@ fn figure(title: &str, note: &str, x: (&str, Axis), y_unit: &str, log: bool, lin
 fn one(d: &Diagnosis) -> Markup {
     html! {
         h3 { "Coverage and reliability over y" sub { "max" } }
-        div class="panels small" { (coverage(d)) (reliability(d)) }
+        div class="panels small" { (coverage(d)) (copies(d)) (reliability(d)) }
         h3 { "Pictures" }
         div class="panels small" {
             @if let Some(e) = &d.transitions { (picture("Transitions (s, s')", &format!("y_max = {}", plain(d.y_max)), e)) }
@@ -164,7 +182,10 @@ fn coverage(d: &Diagnosis) -> Markup {
     let over = |f: &dyn Fn(&AtBound) -> Option<f64>| {
         d.bounds_of_y.iter().map(|b| f(b).and_then(|v| bare(b.y_max, v))).collect::<Vec<_>>()
     };
-    let without = d.bounds_of_y.iter().map(|b| d.covered_by_target.source.and_then(|v| bare(b.y_max, v)));
+    let without = |of: &dyn Fn(Coverage) -> Option<f64>| {
+        let value = d.covered_by_target.and_then(of);
+        d.bounds_of_y.iter().map(|b| value.and_then(|v| bare(b.y_max, v))).collect::<Vec<_>>()
+    };
     figure(
         "Coverage",
         "of states, by generated rows",
@@ -172,21 +193,39 @@ fn coverage(d: &Diagnosis) -> Markup {
         "share",
         false,
         vec![
-            line("target states", "m0", over(&|b| Some(b.coverage.target)).into_iter()),
-            line("source states", "m1", over(&|b| b.coverage.source).into_iter()),
-            line("source states, by target rows", "f1", without),
+            line("target states", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
+            line("the same by target rows", "f0", without(&|c| Some(c.target)).into_iter()),
+            line("source states", "m1", over(&|b| b.coverage.and_then(|c| c.source)).into_iter()),
+            line("the same by target rows", "f1", without(&|c| c.source).into_iter()),
+        ],
+    )
+}
+
+fn copies(d: &Diagnosis) -> Markup {
+    let over = |f: &dyn Fn(&Memorisation) -> f64| {
+        d.bounds_of_y.iter().map(|b| b.memorisation.as_ref().and_then(|m| bare(b.y_max, f(m)))).collect::<Vec<_>>()
+    };
+    figure(
+        "Copies",
+        "rows that pass the filter, against held-out rows",
+        ("y_max", y_axis(d)),
+        "P(nearer to training rows)",
+        false,
+        vec![
+            line("generated rows", "m0", over(&|m| m.probability).into_iter()),
+            line("copies", "f1", over(&|m| m.of_copies).into_iter()),
+            line("fresh rows", "f0", over(&|_| 0.5).into_iter()),
         ],
     )
 }
 
 fn reliability(d: &Diagnosis) -> Markup {
+    let few = format!("{} against abundant target rows", d.target_rows);
     type Get = fn(&Reliability) -> Option<Spread>;
     let panels: [(&str, &str, &str, bool, Get); 5] = [
         ("Distance of ŝ", "to the nearest real state", "standard deviations", false, |r| r.distance),
-        ("Transition KL", "5k against abundant target rows", "nats per dimension (logarithmic)", true, |r| {
-            r.transition_kl
-        }),
-        ("Reward difference", "5k against abundant target rows", "|ΔR| (logarithmic)", true, |r| r.reward_difference),
+        ("Transition KL", &few, "nats per dimension (logarithmic)", true, |r| r.transition_kl),
+        ("Reward difference", &few, "|ΔR| (logarithmic)", true, |r| r.reward_difference),
         ("Reward error", "against the simulator at (ŝ, â)", "|r̂ − r| (logarithmic)", true, |r| r.reward_error),
         ("Dynamics consistency", "ŝ' against the simulator", "steps (logarithmic)", true, |r| r.consistency),
     ];
@@ -291,15 +330,16 @@ fn theorem(b: &Bounds) -> Markup {
 
 fn table(d: &Diagnosis) -> Markup {
     let mut rows: Vec<(&str, String)> = Vec::new();
-    if let Some(m) = &d.memorisation {
+    if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
         rows.push((
             "Nearest training row: generated rows / rows of other episodes",
             format!("{} / {}", number(m.generated.median), number(m.held_out.median)),
         ));
         rows.push((
             "Probability that the generated row is the nearer one",
-            format!("{:.2}{}", m.probability, if m.copied() { ", copies" } else { "" }),
+            format!("{:.2} (fresh rows .5, copies {:.2})", m.probability, m.of_copies),
         ));
+        rows.push(("Generated rows that are a training row", percent(m.identical)));
     }
     let pair = |p: (f64, f64)| format!("{} / {}", number(p.0), number(p.1));
     let l = &d.labels;
@@ -313,7 +353,7 @@ fn table(d: &Diagnosis) -> Markup {
     }
     rows.extend(l.terminal.map(|t| ("Generated rows whose terminal flag is not the simulator's", percent(t))));
     rows.push(("Real target rows that the filter would reject", percent(d.sampled.real_rejected)));
-    if let Some(at) = d.bounds_of_y.iter().find(|b| (b.y_max - d.y_max).abs() < 1e-9) {
+    if let Some(at) = d.at_own_bound() {
         rows.push(("Generated rows that it rejects", percent(at.rejected)));
     }
     if let Some(b) = &d.theorem {
@@ -323,8 +363,24 @@ fn table(d: &Diagnosis) -> Markup {
         ] {
             let Some(c) = curve else { continue };
             let all = c.all.last().copied().unwrap_or(f64::NAN);
-            rows.push((text, format!("{} / {} / {}", number(c.generated), number(c.source[1]), number(all))));
+            let generated = c.generated.mean();
+            rows.push((text, format!("{} / {} / {}", number(generated), number(c.source(1).mean()), number(all))));
         }
+        if let Some(c) = &b.value_alone {
+            let whole = c.source(GRID.len() - 1);
+            let all = [c.generated.mean_doubt(), c.source(1).mean_doubt(), whole.mean_doubt()].map(number).join(" / ");
+            rows.push(("Doubt of the latter: how far models that lack a third of the episodes are apart", all));
+        }
+        if let Some((gap, doubt)) = b.held_out {
+            let text = "|ΔV| of target rows by models that lack them / how far the models are apart there";
+            rows.push((text, format!("{} / {}", number(gap), number(doubt))));
+        }
+    }
+    if let Some(c) = &d.choice {
+        rows.push(("λ of the rule, from the data alone", chosen(c)));
+    }
+    if let Some(c) = &d.choice_by_simulator {
+        rows.push(("λ of the rule where the simulator measures", chosen(c)));
     }
     html! {
         div class="scroll" {
@@ -336,8 +392,9 @@ fn table(d: &Diagnosis) -> Markup {
     }
 }
 
-/// A run of TCE's mixture: its λ, its title and mean score.
+/// A run of TCE's mixture: its λ, its title and mean score, and the configuration but for λ.
 struct Mixed {
+    rest: toml::Table,
     lambda: f64,
     title: String,
     score: f64,
@@ -351,38 +408,42 @@ fn mixtures(study: &Study, analysis: &Analysis, task: Task) -> Vec<Mixed> {
         let cell = row.cells[m].as_ref()?;
         let run = study.runs.iter().find(|r| r.task == task && r.method == method.id)?;
         let config: toml::Table = toml::from_str(&run.folder.config).ok()?;
-        let mixture = config.get("mixture")?;
+        let mixture = config.get("mixture")?.clone();
         let text = |key: &str| mixture.get(key).and_then(toml::Value::as_str);
         let lambda = match (text("generated")?, text("source")?) {
             ("tce", "none") => 0.0,
             ("tce", "nearest") => mixture.get("lambda")?.as_float()?,
             _ => return None,
         };
-        // Ablations of another part say nothing of λ.
-        ["tce-og", "tce-nn"].contains(&method.variant.as_str()).then(|| Mixed {
+        Some(Mixed {
+            rest: without_mixture(config),
             lambda,
             title: method.title.clone(),
             score: cell.mean,
             seeds: cell.seeds,
         })
     };
-    analysis.methods.iter().enumerate().filter_map(of).collect()
+    let all: Vec<Mixed> = analysis.methods.iter().enumerate().filter_map(of).collect();
+    // Runs that differ in anything else say nothing of λ: the most of one kind, those of the first method among equals.
+    let like = |rest: &toml::Table| all.iter().filter(|m| m.rest == *rest).count();
+    let most = all.iter().map(|m| like(&m.rest)).max().unwrap_or(0);
+    let Some(rest) = all.iter().find(|m| like(&m.rest) == most).map(|m| m.rest.clone()) else { return all };
+    all.into_iter().filter(|m| m.rest == rest).collect()
+}
+
+/// Everything but what decides on source rows.
+fn without_mixture(mut config: toml::Table) -> toml::Table {
+    if let Some(mixture) = config.get_mut("mixture").and_then(toml::Value::as_table_mut) {
+        mixture.remove("source");
+        mixture.remove("lambda");
+    }
+    config
 }
 
 /// What the rule picks, beside what was best in hindsight.
 fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
-    let rows: Vec<(Task, Vec<&Diagnosis>)> = {
-        let mut rows: Vec<(Task, Vec<&Diagnosis>)> = Vec::new();
-        for d in all {
-            if let (Some(task), Some(_)) = (d.task, &d.choice) {
-                match rows.iter_mut().find(|(t, _)| *t == task) {
-                    Some((_, list)) => list.push(d),
-                    None => rows.push((task, vec![d])),
-                }
-            }
-        }
-        rows
-    };
+    let rows: Vec<(Task, &Diagnosis, &Choice)> =
+        all.iter().filter_map(|d| Some((d.task?, *d, d.choice.as_ref()?))).collect();
     if rows.is_empty() {
         return html! {};
     }
@@ -390,26 +451,28 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
     html! {
         h3 { "λ from the data alone" }
         p {
-            "The rule takes the λ with the least bound of Theorem 1 on values, measured by models of the target rows alone, and a smaller λ \
-             where the difference is within its noise. In hindsight: the mixture of this study with the highest mean score."
+            "The rule takes the λ with the least bound of Theorem 1 on values, measured by models of the target rows alone. Where the bounds \
+             differ by no more than these models are in doubt, it cannot tell, and λ = 0 stands by default. Beside it, what the simulator \
+             would have said, and in hindsight the mixture of this study with the highest mean score, where there are two that differ in \
+             λ alone."
         }
         div class="scroll" {
             table {
                 thead { tr {
-                    th class="first" { "Task" } th { "λ of the rule" } th { "Least bound at" } th { "|ΔV| generated" } th { "|ΔV| at the least" }
+                    th class="first" { "Task" } th class="text" { "Diagnosis" } th class="text" { "λ of the rule" } th { "Least bound at" } th class="text" { "By the simulator" }
                     th class="edge text" { "Scores by λ" } th class="text" { "Best in hindsight" }
                 } }
                 tbody {
-                    @for (task, diagnoses) in &rows {
-                        @let choices: Vec<_> = diagnoses.iter().filter_map(|d| d.choice).collect();
+                    @for (task, d, choice) in &rows {
                         @let mixed = mixtures(study, analysis, *task);
-                        @let best = mixed.iter().max_by(|a, b| a.score.total_cmp(&b.score)).filter(|_| mixed.len() > 1);
+                        @let several = mixed.iter().any(|m| m.lambda != mixed[0].lambda);
+                        @let best = mixed.iter().max_by(|a, b| a.score.total_cmp(&b.score)).filter(|_| several);
                         tr {
                             th scope="row" { (short(task)) }
-                            td { (list(choices.iter().map(|c| plain(c.lambda)).collect())) }
-                            td { (list(choices.iter().map(|c| plain(c.least)).collect())) }
-                            td { (list(choices.iter().map(|c| number(c.generated_alone)).collect())) }
-                            td { (list(choices.iter().map(|c| number(c.least_bound)).collect())) }
+                            td class="text" { (d.of) ", seed " (d.seed) }
+                            td class="text" { (chosen(choice)) }
+                            td { (plain(choice.least)) }
+                            td class="text" { (d.choice_by_simulator.as_ref().map_or("–".into(), chosen)) }
                             td class="edge text" {
                                 (list(mixed.iter().map(|m| format!("{} {}: {} ({})", m.title, plain(m.lambda), minus(format!("{:.1}", m.score)), counted(m.seeds, "seed", "seeds"))).collect()))
                             }
@@ -428,7 +491,8 @@ fn explanation() -> Markup {
             p {
                 b { "Coverage. " } "A state of either domain is covered if a generated state lies within the distance of its "
                 (NEIGHBOUR) "th nearest neighbour among the states of its own domain (Naeem et al. 2020); the paper does not define its \
-                 curve. Equally many rows of the very same distribution would cover 97 %."
+                 curve. All sets have the same number of rows, so that rows of the very same distribution cover 97 %; covering target rows \
+                 are others than those that are covered."
             }
             p {
                 b { "Reliability. " } "Lines are medians, bands reach from the 10th to the 90th percentile. Abundant rows are what the \
@@ -436,12 +500,16 @@ fn explanation() -> Markup {
                  the rejected rows are two parts of one sample."
             }
             p {
-                b { "Copies. " } "Rows are called copies if they lie nearer to a training row than rows of other episodes do with a probability above "
-                (COPIES) " (after Meehan et al. 2020); one half is what a perfect generator gets."
+                b { "Copies. " } "The rows of every episode, and as large a share of the generated rows, are measured by their nearest training row of \
+                 the other episodes (after Meehan et al. 2020). P is the probability that the generated row is the nearer one: one half for \
+                 fresh rows. Rows are called copies from half the way between that and what copies get, and beside the data below "
+                (BESIDE) ". Where every episode is a place of its own, fresh rows get the P of copies."
             }
             p {
                 b { "Theorem 1. " } "Expectations over ρ" sub { "mix" } " are means over rows. V is that of implicit Q-learning on target and generated \
-                 rows. By the data alone, the target's dynamics are three models of the target rows; otherwise they are the simulator. In a \
+                 rows. By the data alone, the target's dynamics are models of the target rows: for values three that lack a third of the \
+                 episodes each, V at the step that they predict, and for total variation one of all rows. Otherwise they are the simulator, and \
+                 for total variation a model of abundant rows. In a \
                  deterministic world the total variation of sharp models is near 1 wherever they differ at all: the bound on values is the one \
                  that tells rows apart."
             }

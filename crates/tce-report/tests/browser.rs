@@ -7,7 +7,7 @@ use std::process::Command;
 
 use tce_data::{Agent, Quality, Shift, Task};
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation, Rated,
     Reliability, Sampled, Spread,
 };
 
@@ -23,6 +23,30 @@ fn browser() -> Option<PathBuf> {
         eprintln!("SKIPPED: no Chromium in PATH");
     }
     found
+}
+
+/// Lines and clouds of a figure that have at least two places; the samples of its key do not count.
+fn drawn(figure: &str) -> usize {
+    let figure = figure.split("</figure>").next().unwrap();
+    let drawing = figure.split("class=\"fig\"").nth(1).expect("a figure has a drawing");
+    let places = |start: &str, attribute: &str| {
+        let parts = drawing.split(start).skip(1).map(|p| p.split('>').next().unwrap().to_owned());
+        let value = move |tag: String| tag.split(attribute).nth(1).and_then(|v| v.split('"').next()).map(str::to_owned);
+        parts.filter_map(value).collect::<Vec<_>>()
+    };
+    let lines = places("<polyline", "points=\"").into_iter().filter(|p| p.split_whitespace().count() > 1);
+    let clouds = places("class=\"dots", "d=\"").into_iter().filter(|d| d.matches('M').count() > 1);
+    lines.count() + clouds.count()
+}
+
+#[test]
+fn drawings_without_data_are_not_taken_for_drawn() {
+    let key = "<div class=\"keys\"><svg class=\"sample dot m0\"><path class=\"dots\" d=\"M5 5h0\"></path></svg></div>";
+    let svg = |inner: &str| format!("{key}<svg class=\"fig\">{inner}</svg></figure>");
+    assert_eq!(drawn(&svg("<path class=\"dots m0\" d=\"\"></path><polyline points=\"1,2\"></polyline>")), 0);
+    let full =
+        "<path class=\"dots m0\" d=\"M1 1h0M2 2h0\"></path><polyline class=\"line\" points=\"1,2 3,4\"></polyline>";
+    assert_eq!(drawn(&svg(full)), 2);
 }
 
 /// The document as the browser has it, and what it wrote on its console.
@@ -60,16 +84,25 @@ fn embedding(groups: &[Group]) -> Embedding {
 }
 
 fn diagnosis(task: Option<Task>) -> Diagnosis {
+    let memorisation = Memorisation {
+        generated: spread(1.0).unwrap(),
+        held_out: spread(0.9).unwrap(),
+        identical: 0.0,
+        probability: 0.45,
+        of_copies: 0.9,
+    };
     let at = |y: f64| AtBound {
         y_max: y,
-        coverage: Coverage { target: 0.9 - y, source: Some(0.1 + y) },
+        lost: 0,
+        coverage: Some(Coverage { target: 0.9 - y, source: Some(0.1 + y) }),
         rejected: 0.1,
+        memorisation: Some(memorisation),
         kept: reliability(y),
         outliers: Some(reliability(2.0 * y)),
     };
     let generated: Vec<f64> = (0..100).map(|i| 0.2 + 0.001 * f64::from(i)).collect();
     let sources: Vec<f64> = (0..100).map(|i| 0.5 + 0.01 * f64::from(i)).collect();
-    let curve = Curve::of(&sources, &generated);
+    let curve = Curve::of(&Rated::certain(sources), &Rated::certain(generated));
     let histogram = |n: u64| Histogram { low: 0.0, high: 0.2, counts: (0..20).map(|k| n + k % 3).collect() };
     Diagnosis {
         of: "tce-og-<b>".into(),
@@ -80,7 +113,8 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
         lambda: 0.0,
         rows: 100,
         target_rows: 5000,
-        covered_by_target: Coverage { target: 1.0, source: Some(0.05) },
+        coverage_rows: 45,
+        covered_by_target: Some(Coverage { target: 0.96, source: Some(0.05) }),
         bounds_of_y: [0.0, 0.1, 0.2].map(at).into(),
         sampled: Sampled {
             y_kept: histogram(5),
@@ -91,7 +125,6 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
         },
         transitions: Some(embedding(&[Group::Source, Group::NearestSource, Group::Target, Group::Generated])),
         states: vec![(0.2, embedding(&[Group::Source, Group::Target, Group::Generated]))],
-        memorisation: Memorisation::of(&[1.0, 1.1], &[0.9, 1.0]),
         labels: Labels {
             held_out_action: Some((0.01, 0.5)),
             held_out_reward: Some((0.02, 0.6)),
@@ -100,6 +133,7 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
             terminal: Some(0.01),
         },
         choice: curve.as_ref().map(Choice::of),
+        choice_by_simulator: curve.as_ref().map(Choice::of),
         theorem: Some(Bounds {
             discount: 0.99,
             r_max: 5.0,
@@ -107,6 +141,7 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
             value: curve.clone(),
             transition_alone: curve.clone(),
             value_alone: curve,
+            held_out: Some((0.1, 0.05)),
         }),
         notes: vec!["a <note>".into()],
     }
@@ -128,12 +163,10 @@ fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
     let (document, console) = open(&browser, &path);
     assert_eq!(console, Vec::<String>::new());
     let figures: Vec<&str> = document.split("<figure>").skip(1).collect();
-    // Coverage, five of reliability, two pictures, two histograms, two bounds.
-    assert_eq!(figures.len(), 12);
+    // Coverage, copies, five of reliability, two pictures, two histograms, two bounds.
+    assert_eq!(figures.len(), 13);
     for figure in figures {
-        let figure = figure.split("</figure>").next().unwrap();
-        let drawn = figure.matches("<polyline").count() + figure.matches("class=\"dots").count();
-        assert!(drawn >= 2, "{figure}");
+        assert!(drawn(figure) >= 2, "{figure}");
     }
     for expected in ["λ = 0", "no copies", "tce-og-&lt;b&gt;", "a &lt;note&gt;"] {
         assert!(document.contains(expected), "{expected}");

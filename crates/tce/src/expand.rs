@@ -129,11 +129,7 @@ impl<'a> Finisher<'a> {
             let whole = |rows: &[f32]| self.units.put_back(&choose(rows, d, &keep));
             let (s, s2) = (whole(states), whole(successors));
             if s.is_empty() {
-                return Err(Error::Failed(format!(
-                    "the filter rejected all {} generated rows; is filter.z_threshold = {} meant?",
-                    keep.len(),
-                    self.filter.z_threshold
-                )));
+                return Err(everything_rejected(keep.len(), self.filter));
             }
             kept.push((s, s2));
         }
@@ -151,6 +147,12 @@ impl<'a> Finisher<'a> {
         };
         Ok(self.models.label(pairs, terminals)?)
     }
+}
+
+/// Of `rows` generated rows none is left.
+pub(crate) fn everything_rejected(rows: usize, filter: &FilterConfig) -> Error {
+    let threshold = filter.z_threshold;
+    Error::Failed(format!("the filter rejected all {rows} generated rows; is filter.z_threshold = {threshold} meant?"))
 }
 
 fn choose(rows: &[f32], d: usize, keep: &[bool]) -> Vec<f32> {

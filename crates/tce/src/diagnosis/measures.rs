@@ -6,8 +6,8 @@ use tce_base::Streams;
 use tce_base::random::choose;
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation,
-    Reliability, Sampled, Spread, coverage, gaussian, memorisation,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Rated, Reliability,
+    Sampled, Spread, coverage, gaussian, memorisation,
 };
 use tce_learn::Densities;
 use tce_nn::Device;
@@ -17,6 +17,7 @@ use super::rows::{Batch, Sampler};
 use super::{Options, Subject, generator};
 use crate::config::SourceRows;
 use crate::error::Result;
+use crate::expand::everything_rejected;
 use crate::mixture::distances;
 use crate::units::Units;
 
@@ -38,10 +39,34 @@ pub struct Work<'a> {
     pub simulator: Option<(tce_data::Agent, tce_data::Shift)>,
 }
 
-/// Source rows that stand for all of them, the nearest to the target first.
-struct Sources {
-    sorted: Transitions,
+/// Source rows that stand for all of them.
+pub struct Sources {
+    /// Those that are measured, the nearest to the target first.
+    pub sorted: Transitions,
+    /// Some of the nearest share.
     nearest: Transitions,
+    /// None of those that are measured: what models may learn from.
+    pub others: Transitions,
+}
+
+/// Equally many states of each domain that coverage is counted over, and of target rows that are none of them.
+struct References {
+    rows: usize,
+    target: coverage::Reference,
+    source: Option<coverage::Reference>,
+    other_target: Transitions,
+}
+
+impl References {
+    /// Coverage by `covering`; None if they are fewer than the reference rows.
+    fn covered_by(&self, covering: &Transitions, units: &Units, streams: &Streams) -> Result<Option<Coverage>> {
+        if covering.len() < self.rows {
+            return Ok(None);
+        }
+        let states = units.states(&few(covering, self.rows, streams, "covering").observations);
+        let source = self.source.as_ref().map(|s| s.covered_by(&states)).transpose()?;
+        Ok(Some(Coverage { target: self.target.covered_by(&states)?, source }))
+    }
 }
 
 impl Work<'_> {
@@ -68,15 +93,18 @@ impl Work<'_> {
         let batches = grid.iter().map(|&y| sampler.sample(options.rows, y, "figures")).collect::<Result<Vec<_>>>()?;
         let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
         let own = &batches[at(config.generator.y_max)];
+        if own.kept() == 0 {
+            return Err(everything_rejected(own.len() + own.lost, &config.filter));
+        }
+        for (y, batch) in grid.iter().zip(&batches).filter(|(_, b)| b.lost > 0) {
+            notes.push(format!(
+                "{} of {} rows generated with y_max = {y} hold numbers that are not finite. They count as rejected, and are part of no \
+                 other figure.",
+                batch.lost, options.rows
+            ));
+        }
         let sources = self.sources(&streams)?;
-        let models = Models::train(
-            self,
-            sources.as_ref().map(|s| &s.sorted),
-            own,
-            *grid.last().expect("a grid"),
-            attempt,
-            device,
-        )?;
+        let models = Models::train(self, sources.as_ref(), own, *grid.last().expect("a grid"), attempt, device)?;
         if self.simulator.is_none() {
             let why =
                 if options.simulator { "its task is not one of the benchmark's" } else { "it was not to be used" };
@@ -85,34 +113,44 @@ impl Work<'_> {
                  and Theorem 1 by models of the target rows alone."
             ));
         }
-        let references = self.references(&streams, sources.as_ref())?;
-        let covered = |states: &[f32]| -> Result<Coverage> {
-            let (target, source) = &references;
-            let source = source.as_ref().map(|s| s.covered_by(states)).transpose()?;
-            Ok(Coverage { target: target.covered_by(states)?, source })
+        let references = self.references(&streams, sources.as_ref(), own.kept())?;
+        if references.is_none() {
+            notes.push("There are too few rows for a coverage.".into());
+        }
+        let covered = |rows: &Transitions| match &references {
+            None => Ok(None),
+            Some(r) => r.covered_by(rows, self.units(), &streams),
         };
-        let covered_by_target = covered(&self.units().states(&target.observations))?;
+        let covered_by_target = match &references {
+            None => None,
+            Some(r) => covered(&r.other_target)?,
+        };
+        let held_out = self.held_out()?;
+        if held_out.is_none() {
+            notes.push("One episode has most of the target rows: there are no held-out rows to tell copies by.".into());
+        }
         let distances = self.distances_to_real(&batches)?;
         let step = generator::step_std(target, &self.units().live);
         let mut bounds_of_y = Vec::new();
         for ((&y, batch), distances) in grid.iter().zip(&batches).zip(&distances) {
             let figures = Figures::of(batch, distances, &models, &step, &self.units().live)?;
+            let kept = batch.kept_rows();
+            let judge = |h: &memorisation::HeldOut| h.judge(&pairs(self.units(), &kept), &streams);
             bounds_of_y.push(AtBound {
                 y_max: decimal(y),
-                coverage: covered(&batch.kept_states(self.units()))?,
-                rejected: 1.0 - batch.kept() as f64 / batch.len() as f64,
+                lost: batch.lost,
+                coverage: covered(&kept)?,
+                rejected: batch.rejected(),
+                memorisation: held_out.as_ref().map(judge).transpose()?.flatten(),
                 kept: figures.reliability(batch, true),
                 outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
             });
-        }
-        let memorisation = self.memorisation(&batches[at(0.0)])?;
-        if memorisation.is_none() {
-            notes.push("The target rows are one episode: there are no held-out rows to tell copies by.".into());
         }
         let theorem = sources.as_ref().map(|s| self.theorem(s, own, &models, &streams)).transpose()?;
         if theorem.is_none() {
             notes.push("Without source rows there is no λ to choose.".into());
         }
+        notes.extend(blown_up(&bounds_of_y, decimal(config.generator.y_max), theorem.as_ref()));
         let mut states = Vec::new();
         for y in [0.0, config.generator.y_max, *grid.last().expect("a grid")] {
             if states.iter().all(|(other, _)| *other != decimal(y)) {
@@ -129,14 +167,15 @@ impl Work<'_> {
             lambda: config.mixture.lambda,
             rows: options.rows,
             target_rows: target.len(),
+            coverage_rows: references.as_ref().map_or(0, |r| r.rows),
             covered_by_target,
             bounds_of_y,
             sampled: self.sampled(own),
             transitions: self.picture(own, sources.as_ref(), &streams, true),
             states,
-            memorisation,
             labels: self.labels(label_errors, own, &models)?,
             choice: theorem.as_ref().and_then(|t| t.value_alone.as_ref()).map(Choice::of),
+            choice_by_simulator: theorem.as_ref().and_then(|t| t.value.as_ref()).map(Choice::of),
             theorem,
             notes,
         })
@@ -150,27 +189,43 @@ impl Work<'_> {
         let mut order: Vec<usize> = (0..all.len()).collect();
         order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]).then(a.cmp(&b)));
         let pick = |from: &[usize], name: &str| {
-            let places = choose(&mut streams.stream(name), from.len(), SOURCES);
-            all.select(&places.into_iter().map(|i| from[i]).collect::<Vec<_>>())
+            let places = choose(&mut streams.stream(name), from.len(), SOURCES.min(all.len() / 2).max(1));
+            places.into_iter().map(|i| from[i]).collect::<Vec<_>>()
         };
         let share =
             if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
         let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
-        Ok(Some(Sources { sorted: pick(&order, "sources"), nearest: pick(&order[..near], "nearest") }))
+        let measured = pick(&order, "sources");
+        let mut free = vec![true; all.len()];
+        measured.iter().for_each(|&i| free[i] = false);
+        let others: Vec<usize> = (0..all.len()).filter(|&i| free[i]).collect();
+        Ok(Some(Sources {
+            sorted: all.select(&measured),
+            nearest: all.select(&pick(&order[..near], "nearest")),
+            others: all.select(&others),
+        }))
     }
 
-    /// Target and source states that coverage is counted over.
-    fn references(
-        &self,
-        streams: &Streams,
-        sources: Option<&Sources>,
-    ) -> Result<(coverage::Reference, Option<coverage::Reference>)> {
-        let reference = |t: &Transitions, name: &str| {
-            let rows = few(t, REFERENCE, streams, name);
-            coverage::Reference::new(self.units().states(&rows.observations), self.units().live.len())
-        };
-        let source = sources.map(|s| reference(&s.sorted, "reference/source")).transpose()?;
-        Ok((reference(&self.subject.inputs.target.rows, "reference/target")?, source))
+    /// As many rows as there are of each kind, `kept` of them generated; None where that is too few for neighbourhoods.
+    fn references(&self, streams: &Streams, sources: Option<&Sources>, kept: usize) -> Result<Option<References>> {
+        let target = &self.subject.inputs.target.rows;
+        let rows = REFERENCE.min(target.len() / 2).min(kept).min(sources.map_or(usize::MAX, |s| s.sorted.len()));
+        if rows <= coverage::NEIGHBOUR {
+            return Ok(None);
+        }
+        let reference =
+            |t: &Transitions| coverage::Reference::new(self.units().states(&t.observations), self.units().live.len());
+        let chosen = choose(&mut streams.stream("reference/target"), target.len(), rows);
+        let mut free = vec![true; target.len()];
+        chosen.iter().for_each(|&i| free[i] = false);
+        let others: Vec<usize> = (0..target.len()).filter(|&i| free[i]).collect();
+        let source = sources.map(|s| reference(&few(&s.sorted, rows, streams, "reference/source"))).transpose()?;
+        Ok(Some(References {
+            rows,
+            target: reference(&target.select(&chosen))?,
+            source,
+            other_target: target.select(&others),
+        }))
     }
 
     /// For every batch, the distance of every row's state to the nearest one of target and source.
@@ -192,18 +247,11 @@ impl Work<'_> {
         Ok(batches.iter().map(&mut take).collect())
     }
 
-    fn memorisation(&self, at_zero: &Batch) -> Result<Option<Memorisation>> {
+    /// Target rows to tell copies by.
+    fn held_out(&self) -> Result<Option<memorisation::HeldOut>> {
         let (units, target) = (self.units(), &self.subject.inputs.target.rows);
-        let d = 2 * units.live.len();
-        let training = pairs(units, target);
-        let episodes: Vec<_> = target.episodes().iter().map(|e| e.start..e.end).collect();
-        let Some(held_out) = memorisation::distances_between_episodes(&training, d, &episodes)? else {
-            return Ok(None);
-        };
-        let generated = pairs(units, &at_zero.rows);
-        let options = NeighbourOptions::default();
-        let generated = nn_distances(&Rows::new(&generated, d), &Rows::new(&training, d), &options)?;
-        Ok(Memorisation::of(&generated, &held_out))
+        let episodes = target.episodes().iter().map(|e| e.start..e.end).collect();
+        Ok(memorisation::HeldOut::new(pairs(units, target), 2 * units.live.len(), episodes)?)
     }
 
     fn sampled(&self, own: &Batch) -> Sampled {
@@ -281,29 +329,54 @@ impl Work<'_> {
                 let [p, q] = [own, truth].map(|member| models.normals(&densities[member]));
                 gaussian::total_variation(p, q, streams)
             };
-            Curve::of(&against(&of_sources, models.source?), &against(&of_generated, models.generated))
+            let rated = |densities: &[Densities], own: usize| Rated::certain(against(densities, own));
+            Curve::of(&rated(&of_sources, models.source?), &rated(&of_generated, models.generated))
         };
         let transition = models.abundant.and_then(tv);
         let value = match self.simulator {
             None => None,
             Some((agent, shift)) => {
-                let gap = |t: &Transitions| -> Result<Vec<f64>> {
+                let gap = |t: &Transitions| -> Result<Rated> {
                     let truth = tce_sim::simulate(agent, shift, &t.observations, &t.actions)?;
-                    Ok(models.value_gap(t, &truth.next_observations, &truth.terminals))
+                    Ok(Rated::certain(models.value_gap(t, &truth.next_observations, &truth.terminals)))
                 };
                 Curve::of(&gap(&sources.sorted)?, &gap(&generated)?)
             }
         };
-        let alone = |t: &Transitions, densities: &[Densities]| models.value_gap_alone(t, densities, inputs.agent);
-        Ok(Bounds {
+        let held_out = Some(models.held_out(&inputs.target.rows, inputs.agent));
+        let mut bounds = Bounds {
             discount: config.learner.iql.discount,
             r_max: inputs.target.rows.rewards.iter().fold(0.0, |m, r| f64::from(r.abs()).max(m)),
             transition,
             value,
-            transition_alone: tv(models.limited[0]),
-            value_alone: Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated)),
-        })
+            transition_alone: tv(models.limited),
+            value_alone: None,
+            held_out,
+        };
+        let calibration = bounds.calibration();
+        let alone = |t: &Transitions, densities: &[Densities]| {
+            let mut rated = models.value_gap_alone(t, densities, inputs.agent);
+            rated.doubt.iter_mut().for_each(|u| *u *= calibration);
+            rated
+        };
+        bounds.value_alone = Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated));
+        Ok(bounds)
     }
+}
+
+/// What is said of rows in which the physics blew up: they are missing in the medians.
+fn blown_up(bounds: &[AtBound], own: f64, theorem: Option<&Bounds>) -> Vec<String> {
+    let of = |r: &Reliability| r.consistency.map_or(0, |c| c.lost);
+    let lost = bounds.iter().find(|b| b.y_max == own).map_or(0, |b| of(&b.kept) + b.outliers.as_ref().map_or(0, of));
+    let rows = (lost > 0).then(|| {
+        format!(
+            "The simulator's physics blew up in {lost} generated rows at y_max = {own}; medians and percentiles leave them out."
+        )
+    });
+    let curves = theorem.and_then(|t| t.value.as_ref()).map(|c| c.lost).filter(|l| *l != (0, 0));
+    let curves = curves
+        .map(|(s, g)| format!("It blew up in {s} source and {g} generated rows of Theorem 1, which leaves them out."));
+    rows.into_iter().chain(curves).collect()
 }
 
 /// One number per row of a batch, for every figure that can be measured.
@@ -321,7 +394,7 @@ impl Figures {
         let t = &batch.rows;
         let kl = |abundant: usize| {
             let densities = models.densities(&t.observations, &t.actions);
-            let (p, q) = (models.normals(&densities[models.limited[0]]), models.normals(&densities[abundant]));
+            let (p, q) = (models.normals(&densities[models.limited]), models.normals(&densities[abundant]));
             gaussian::kl(p, q).into_iter().map(|v| v / p.dim as f64).collect()
         };
         let difference = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).collect();

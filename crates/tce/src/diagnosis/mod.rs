@@ -36,7 +36,7 @@ use measures::Work;
 use rows::Sampler;
 
 /// Changes when the same rows would give other figures.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
 
@@ -86,6 +86,20 @@ pub struct Subject<'a> {
     pub seed: u64,
 }
 
+/// Refuses a run without coverage expansion, before its data are read or collected.
+///
+/// # Errors
+/// If the run has no generated rows of TCE.
+pub fn can_be_diagnosed(of: &str, config: &Config) -> Result<()> {
+    match config.mixture.generated {
+        GeneratedRows::Tce => Ok(()),
+        other => Err(Error::Usage(format!(
+            "{of}: found mixture.generated = {other:?}, expected \"tce\": there is no coverage expansion to diagnose; choose a run of \
+             tce-og or another variant with generated rows"
+        ))),
+    }
+}
+
 /// Diagnoses, or takes the result from its stage under `root`. Returns it with the stage's directory.
 ///
 /// # Errors
@@ -94,6 +108,8 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     #[derive(Serialize)]
     struct Spec<'a> {
         version: u32,
+        of: &'a str,
+        task: Option<Task>,
         inputs: crate::inputs::InputSpec,
         config: serde_json::Value,
         seeds: &'a [u64],
@@ -101,29 +117,35 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         options: &'a Options,
     }
     let Subject { inputs, config, seeds, seed, .. } = *subject;
-    if config.mixture.generated != GeneratedRows::Tce {
-        return Err(Error::Usage(format!(
-            "{}: found mixture.generated = {:?}, expected \"tce\": there is no coverage expansion to diagnose; choose a run of tce-og \
-             or another variant with generated rows",
-            subject.of, config.mixture.generated
-        )));
-    }
+    can_be_diagnosed(&subject.of, config)?;
     let member = seeds
         .iter()
         .position(|s| *s == seed)
         .ok_or_else(|| Error::Usage(format!("--seed {seed}: the run's seeds are {seeds:?}; choose one of them")))?;
-    let found = inputs.target.rows.len();
-    if found < FEWEST {
-        return Err(Error::Usage(format!(
-            "{}: found {found} target rows, expected at least {FEWEST}: nothing can be said of generated rows beside so few",
-            inputs.target.file.display()
-        )));
+    let source = inputs.source.as_ref().map(|s| ("source", s));
+    for (name, table) in [("target", &inputs.target)].into_iter().chain(source) {
+        let found = table.rows.len();
+        if found < FEWEST {
+            return Err(Error::Usage(format!(
+                "{}: found {found} {name} rows, expected at least {FEWEST}: nothing can be said of generated rows beside so few",
+                table.file.display()
+            )));
+        }
     }
     let used = serde_json::json!({
         "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
         "iql": config.learner.iql, "batch": config.learner.batch,
     });
-    let spec = Spec { version: VERSION, inputs: inputs.spec(true), config: used, seeds, seed, options };
+    let spec = Spec {
+        version: VERSION,
+        of: &subject.of,
+        task: subject.task,
+        inputs: inputs.spec(true),
+        config: used,
+        seeds,
+        seed,
+        options,
+    };
     let stage = Stage::open(root, "stages/diagnosis", &spec)?;
     let file = "diagnosis.json".to_owned();
     if stage.summary::<serde_json::Value>()?.is_some() {

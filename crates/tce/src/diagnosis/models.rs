@@ -2,18 +2,21 @@
 //!
 //! | model | rows |
 //! |---|---|
-//! | limited, three of them | the target rows |
+//! | limited | the target rows |
+//! | thirds, three of them | the target rows without a third of the episodes each |
 //! | abundant | what the simulator makes of states and actions of target, source and generated rows |
 //! | source | source rows |
 //! | generated | generated rows |
 //! | value | V of IQL on target and generated rows |
 //!
-//! The limited model is what a user has. Three of them differ in their initial weights and batches alone.
+//! The limited model is what a user has. The generator saw the rows that it saw, so that both may err alike; the three that lack a third
+//! say where what they agree on is no more than what each of them was told, and on the rows that they lack how wrong they are.
 
 use std::sync::Arc;
 
 use tce_base::Streams;
 use tce_data::{Agent, Standardizer, Transitions};
+use tce_diagnosis::Rated;
 use tce_diagnosis::gaussian::Normals;
 use tce_learn::{
     Buffer, Densities, Iql, IqlConfig, LabelModels, Member, Regulariser, RegulariserKind, Steps, TerminalHandling,
@@ -22,7 +25,7 @@ use tce_learn::{
 use tce_nn::Device;
 use tce_sim::{simulate, terminal_rule};
 
-use super::measures::{Work, few};
+use super::measures::{Sources, Work, few};
 use super::rows::Batch;
 use crate::error::{Error, Result};
 use crate::stage::Attempt;
@@ -30,14 +33,15 @@ use crate::units::even_standardizer;
 
 /// Fewer source rows than this make no model.
 const FEWEST_SOURCES: usize = 1000;
-/// Members of the population that are trained on the target rows.
-const LIMITED: usize = 3;
+/// Parts of the target rows, and models that lack one of them.
+const THIRDS: usize = 3;
 
 /// The trained models.
 pub struct Models {
     transition: TransitionModel,
     /// Members of the population.
-    pub limited: [usize; LIMITED],
+    pub limited: usize,
+    thirds: [usize; THIRDS],
     pub generated: usize,
     pub source: Option<usize>,
     pub abundant: Option<usize>,
@@ -70,7 +74,7 @@ impl Models {
     /// Trains them all. `own` are generated rows under the run's own bound; the abundant rows reach up to the bound `widest`.
     pub fn train(
         work: &Work,
-        sources: Option<&Transitions>,
+        sources: Option<&Sources>,
         own: &Batch,
         widest: f32,
         attempt: &Attempt,
@@ -81,8 +85,9 @@ impl Models {
         let target = Arc::new(inputs.target.rows.clone());
         let many = options.abundant / 2;
         // Other rows than those that are measured: a model must not be asked about what it was trained on.
-        let generated = work.sampler.sample(many.max(own.len()), config.generator.y_max, "training")?.kept_rows();
-        let source = (inputs.source.as_ref()).map(|s| few(&s.rows, many.max(FEWEST_SOURCES), &streams, "source rows"));
+        let generated = work.sampler.sample(many.max(own.len()), config.generator.y_max, "training")?;
+        let generated = generated.some_kept(&config.filter)?.kept_rows();
+        let source = sources.map(|s| few(&s.others, many.max(FEWEST_SOURCES), &streams, "source rows"));
         let (mut at_source, mut at_generated, mut abundant) = (None, None, None);
         if let Some(place) = work.simulator {
             let wide = work.sampler.sample(many.max(own.len()), widest, "abundant")?.rows;
@@ -92,7 +97,8 @@ impl Models {
                 all.extend(&under_target(place, source)?);
             }
             abundant = Some(Arc::new(all));
-            at_source = sources.map(|s| under_target(place, &few(s, own.len(), &streams, "at source"))).transpose()?;
+            at_source =
+                sources.map(|s| under_target(place, &few(&s.sorted, own.len(), &streams, "at source"))).transpose()?;
             at_generated = Some(under_target(place, &own.kept_rows())?);
         }
         let standardizer = even_standardizer(&inputs.target.rows, inputs.source.as_ref().map(|s| &s.rows));
@@ -107,7 +113,12 @@ impl Models {
             });
             members.len() - 1
         };
-        let limited = ["limited 0", "limited 1", "limited 2"].map(|name| add(name, &target));
+        let limited = add("limited", &target);
+        let third_of = thirds(&target);
+        let thirds = [0, 1, 2].map(|k| {
+            let others: Vec<usize> = (0..target.len()).filter(|&i| third_of[i] != k).collect();
+            add(&format!("without third {k}"), &Arc::new(target.select(&others)))
+        });
         let generated = Arc::new(generated);
         let of_generated = add("generated", &generated);
         let of_source = source.map(|s| add("source", &Arc::new(s)));
@@ -136,8 +147,8 @@ impl Models {
 
         let member = Member {
             streams: streams.child("value"),
+            standardizer: even_standardizer(&target, Some(&generated)),
             parts: vec![target.clone(), generated],
-            standardizer: Standardizer::fit(&target.observations, target.obs_dim),
             reward_scale: 1.0,
             row_scores: None,
         };
@@ -155,6 +166,7 @@ impl Models {
             dim: transition.dim(),
             transition,
             limited,
+            thirds,
             generated: of_generated,
             source: of_source,
             abundant: of_abundant,
@@ -199,17 +211,115 @@ impl Models {
         own.iter().zip(other).map(|(a, b)| (a - b).abs()).collect()
     }
 
-    /// The same with the truth as the limited models see it: their mean of V at their mean successors. `densities` are those of `t`.
-    pub fn value_gap_alone(&self, t: &Transitions, densities: &[Densities], agent: Option<Agent>) -> Vec<f64> {
-        let own = self.values(&t.next_observations, &t.terminals);
-        let mut mean = vec![0.0; t.len()];
-        for &m in &self.limited {
+    /// V at the successors that each of the thirds predicts, per model. `densities` are those of `t`.
+    fn predicted_values(&self, t: &Transitions, densities: &[Densities], agent: Option<Agent>) -> Vec<Vec<f64>> {
+        let of = |&m: &usize| {
             let next = self.transition.next_observations(&t.observations, &densities[m]);
-            let over = |s: &[f32]| agent.is_some_and(|agent| terminal_rule(agent, s));
-            let terminals: Vec<bool> = next.chunks_exact(t.obs_dim).map(over).collect();
-            let values = self.values(&next, &terminals);
-            mean.iter_mut().zip(values).for_each(|(m, v)| *m += v / self.limited.len() as f64);
+            self.values(&next, &successor_terminals(agent, t, &next))
+        };
+        self.thirds.iter().map(of).collect()
+    }
+
+    /// [`Models::value_gap`] with the truth as the thirds see it, V(μ) of each: the mean of their gaps, and as a doubt how far they are
+    /// apart, the mean over their pairs. V at a mean is not the mean of V; where the world is deterministic the two are one.
+    pub fn value_gap_alone(&self, t: &Transitions, densities: &[Densities], agent: Option<Agent>) -> Rated {
+        let own = self.values(&t.next_observations, &t.terminals);
+        let predicted = self.predicted_values(t, densities, agent);
+        let gap = |i: usize| predicted.iter().map(|v| (own[i] - v[i]).abs()).sum::<f64>() / predicted.len() as f64;
+        Rated {
+            gap: (0..t.len()).map(gap).collect(),
+            doubt: (0..t.len()).map(|i| disagreement(&predicted, i)).collect(),
         }
-        own.iter().zip(mean).map(|(a, b)| (a - b).abs()).collect()
+    }
+
+    /// Mean gap of target rows by the model that lacks them, and mean doubt of all three: how much of a model's error their
+    /// disagreement shows.
+    pub fn held_out(&self, target: &Transitions, agent: Option<Agent>) -> (f64, f64) {
+        let own = self.values(&target.next_observations, &target.terminals);
+        let densities = self.densities(&target.observations, &target.actions);
+        let predicted = self.predicted_values(target, &densities, agent);
+        let third_of = thirds(target);
+        let n = target.len() as f64;
+        let gap = (0..target.len()).map(|i| (own[i] - predicted[third_of[i]][i]).abs()).sum::<f64>() / n;
+        (gap, (0..target.len()).map(|i| disagreement(&predicted, i)).sum::<f64>() / n)
+    }
+}
+
+/// Mean |difference| over the pairs of models in row `i`.
+fn disagreement(models: &[Vec<f64>], i: usize) -> f64 {
+    let pairs = (0..models.len()).flat_map(|a| (0..a).map(move |b| (a, b)));
+    let (sum, count) = pairs.fold((0.0, 0), |(s, n), (a, b)| (s + (models[a][i] - models[b][i]).abs(), n + 1));
+    sum / f64::from(count.max(1))
+}
+
+/// Whether the episode is over at predicted successors of `t`: by the agent's rule, or, where there is none, wherever `t` itself says
+/// so. A model of states alone cannot know; with the same flag on both sides it makes no difference.
+fn successor_terminals(agent: Option<Agent>, t: &Transitions, next: &[f32]) -> Vec<bool> {
+    match agent {
+        Some(agent) => next.chunks_exact(t.obs_dim).map(|s| terminal_rule(agent, s)).collect(),
+        None => t.terminals.clone(),
+    }
+}
+
+/// The third that each row belongs to: whole episodes, whose rows are alike, and equal parts of the log where it has fewer than three.
+fn thirds(t: &Transitions) -> Vec<usize> {
+    let n = t.len();
+    let by_place = |i: usize| i * THIRDS / n;
+    let episodes = t.episodes();
+    if episodes.len() < THIRDS {
+        return (0..n).map(by_place).collect();
+    }
+    // By the middle of each, so that the parts are as equal as whole episodes allow; every part gets one at least.
+    let last = episodes.len() - 1;
+    let part = |(k, e): (usize, &tce_data::Episode)| match k {
+        0 => 0,
+        k if k == last => THIRDS - 1,
+        _ => by_place((e.start + e.end) / 2),
+    };
+    let mut parts: Vec<usize> = episodes.iter().enumerate().map(part).collect();
+    if !parts.contains(&1) {
+        let place = parts.iter().rposition(|p| *p == 0).filter(|p| *p > 0).unwrap_or(1);
+        parts[place] = 1;
+    }
+    episodes.iter().zip(parts).flat_map(|(e, part)| vec![part; e.end - e.start]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn log(lengths: &[usize]) -> Transitions {
+        let mut t = Transitions::new(1, 1);
+        for &length in lengths {
+            (0..length).for_each(|i| t.push(&[0.0], &[0.0], 0.0, &[0.0], false, i + 1 == length));
+        }
+        t
+    }
+
+    #[test]
+    fn thirds_are_whole_episodes_and_none_is_empty() {
+        assert_eq!(thirds(&log(&[2, 2, 2])), [0, 0, 1, 1, 2, 2]);
+        assert_eq!(thirds(&log(&[1; 6])), [0, 0, 1, 1, 2, 2]);
+        assert_eq!(thirds(&log(&[9, 1, 1])), [[0; 9].as_slice(), &[1, 2]].concat());
+        assert_eq!(thirds(&log(&[1, 1, 9])), [[0, 1].as_slice(), &[2; 9]].concat());
+        assert_eq!(thirds(&log(&[4, 2])), [0, 0, 1, 1, 2, 2], "too few episodes");
+    }
+
+    #[test]
+    fn the_disagreement_is_the_mean_over_the_pairs() {
+        let models = [vec![0.0, 1.0], vec![1.0, 1.0], vec![4.0, 1.0]];
+        assert!((disagreement(&models, 0) - (1.0 + 4.0 + 3.0) / 3.0).abs() < 1e-12);
+        assert_eq!(disagreement(&models, 1), 0.0);
+    }
+
+    /// The same flag on both sides where there is no rule: V of a row that is over is 0 twice.
+    #[test]
+    fn successors_of_an_own_robot_are_over_where_the_rows_are() {
+        let mut t = log(&[2]);
+        t.terminals = vec![true, false];
+        assert_eq!(successor_terminals(None, &t, &t.next_observations), t.terminals);
+        let mut hopper = Transitions::new(11, 3);
+        hopper.push(&[0.0; 11], &[0.0; 3], 0.0, &[0.0; 11], false, true);
+        assert_eq!(successor_terminals(Some(Agent::Hopper), &hopper, &[0.0; 11]), [true], "it lies on the ground");
     }
 }

@@ -6,11 +6,10 @@ use tce_data::{Agent, Shift, Transitions};
 use tce_diffusion::uniform_labels;
 use tce_sim::{Simulated, simulate};
 
-use crate::config::GeneratorConfig;
+use crate::config::{FilterConfig, GeneratorConfig};
 use crate::error::{Error, Result};
-use crate::expand::Finisher;
+use crate::expand::{Finisher, everything_rejected};
 use crate::generator::Generator;
-use crate::units::Units;
 
 /// Where rows come from.
 pub struct Sampler<'a> {
@@ -35,6 +34,8 @@ pub struct Batch {
     pub labels: Vec<f32>,
     /// What the target's dynamics do at (ŝ, â).
     pub simulated: Option<Simulated>,
+    /// Rows that hold a number that is not finite: neither labelled nor simulated, and not among `rows`.
+    pub lost: usize,
 }
 
 impl Batch {
@@ -46,14 +47,22 @@ impl Batch {
         self.keep.iter().filter(|k| **k).count()
     }
 
+    /// Share of all rows drawn that the filter rejects; in the pipeline it rejects lost rows as well.
+    pub fn rejected(&self) -> f64 {
+        1.0 - self.kept() as f64 / (self.len() + self.lost) as f64
+    }
+
     /// The rows that pass the filter.
     pub fn kept_rows(&self) -> Transitions {
         self.rows.select(&(0..self.len()).filter(|&i| self.keep[i]).collect::<Vec<_>>())
     }
 
-    /// Their live, standardised states.
-    pub fn kept_states(&self, units: &Units) -> Vec<f32> {
-        units.states(&self.kept_rows().observations)
+    /// Refuses a sample of which the filter leaves nothing: there is nothing to measure, nor to learn from.
+    pub fn some_kept(self, filter: &FilterConfig) -> Result<Self> {
+        match self.kept() {
+            0 => Err(everything_rejected(self.len() + self.lost, filter)),
+            _ => Ok(self),
+        }
     }
 }
 
@@ -85,6 +94,7 @@ impl Sampler<'_> {
                 kept_labels.push(label);
             }
         }
+        let lost = rows - kept_labels.len();
         if kept_labels.is_empty() {
             return Err(Error::Failed(format!(
                 "none of the {rows} rows generated with y_max = {y_max} is made of finite numbers: the score networks have diverged"
@@ -96,6 +106,6 @@ impl Sampler<'_> {
             Some((agent, shift)) => Some(simulate(agent, shift, &rows.observations, &rows.actions)?),
             None => None,
         };
-        Ok(Batch { rows, keep, labels: kept_labels, simulated })
+        Ok(Batch { rows, keep, labels: kept_labels, simulated, lost })
     }
 }

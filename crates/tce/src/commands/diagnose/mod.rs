@@ -6,12 +6,12 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::{FileError, read_if_there, write_atomically};
 use tce_data::Task;
-use tce_diagnosis::{AtBound, Diagnosis, Spread};
+use tce_diagnosis::{AtBound, Diagnosis, Spread, Verdict};
 use tce_learn::TransitionConfig;
 use tce_nn::cpu;
 
 use crate::config::Config;
-use crate::diagnosis::{Options, Subject, diagnose};
+use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose};
 use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, Inputs};
 use crate::layers::ConfigArgs;
@@ -178,6 +178,13 @@ impl RunArgs {
                 )));
             }
         }
+        for (name, value) in [("--transition-steps", self.transition_steps), ("--value-steps", self.value_steps)] {
+            if value == 0 {
+                return Err(Error::Usage(format!(
+                    "{name} 0: expected at least 1; an untrained model measures nothing"
+                )));
+            }
+        }
         let defaults = Options::default();
         let options = Options {
             rows: self.rows,
@@ -196,6 +203,7 @@ impl RunArgs {
                         "--preset, --config and --set belong to files of your own; a run has its configuration".into(),
                     ));
                 }
+                can_be_diagnosed(&directory.display().to_string(), &run.config)?;
                 let root = self.out.unwrap_or_else(|| run.root.clone());
                 let data = DataArgs {
                     source: self.source,
@@ -250,14 +258,15 @@ struct Written {
 fn render_run(written: &Written) -> String {
     let d = &written.diagnosis;
     let figure = |s: Option<Spread>| s.map_or("-".into(), |s| format!("{:.3}", s.median));
+    let share = |s: Option<f64>| s.map_or("-".into(), |s| format!("{s:.2}"));
     let both = |b: &AtBound, f: &dyn Fn(&tce_diagnosis::Reliability) -> Option<Spread>| {
         format!("{} / {}", figure(f(&b.kept)), figure(b.outliers.as_ref().and_then(f)))
     };
     let lines = d.bounds_of_y.iter().map(|b| {
         [
             format!("{}", b.y_max),
-            format!("{:.2}", b.coverage.target),
-            b.coverage.source.map_or("-".into(), |s| format!("{s:.2}")),
+            share(b.coverage.map(|c| c.target)),
+            share(b.coverage.and_then(|c| c.source)),
             format!("{:.1} %", 100.0 * b.rejected),
             both(b, &|r| r.distance),
             both(b, &|r| r.transition_kl),
@@ -278,18 +287,28 @@ fn render_run(written: &Written) -> String {
         "consistency",
     ];
     let mut text = format!("{}, seed {}: medians of kept / rejected rows\n{}\n", d.of, d.seed, table(&header, lines));
-    if let Some(m) = &d.memorisation {
+    if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
         text += &format!(
-            "copies: a generated row is nearer to a training row than a held-out row with probability {:.2}{}\n",
+            "copies: a generated row is nearer to a training row than a held-out row with probability {:.2} (copies: {:.2}); {}\n",
             m.probability,
-            if m.copied() { ": it looks like a copy" } else { "" }
+            m.of_copies,
+            match m.verdict() {
+                Verdict::Copies => "they look like copies",
+                Verdict::Fresh => "they look like fresh rows",
+                Verdict::Beside => "they lie beside the data",
+            }
         );
     }
     if let Some(c) = &d.choice {
+        let said = if c.told { "" } else { ", the default: models of the target rows cannot tell" };
         text += &format!(
-            "λ from the data alone: {} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
+            "λ from the data alone: {}{said} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
             c.lambda, c.least_bound, c.generated_alone
         );
+    }
+    if let Some(c) = &d.choice_by_simulator {
+        let said = if c.told { "" } else { ", not told from others" };
+        text += &format!("λ by the simulator: {}{said}\n", c.lambda);
     }
     for note in &d.notes {
         text += &format!("note: {note}\n");
