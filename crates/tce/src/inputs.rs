@@ -103,6 +103,15 @@ fn table(path: &Path, dims: Option<(usize, usize)>) -> Result<Table> {
     Ok(Table { rows: transitions, file: path.to_owned(), hash: sha256_file(path)? })
 }
 
+/// The first `rows` rows, the last of which ends its episode; None where those are all (0 means all of them, too).
+pub(crate) fn first_rows(t: &Transitions, rows: usize) -> Option<Transitions> {
+    (rows > 0 && rows < t.len()).then(|| {
+        let mut first = t.select(&(0..rows).collect::<Vec<_>>());
+        first.timeouts[rows - 1] = !first.terminals[rows - 1];
+        first
+    })
+}
+
 impl Inputs {
     /// A user's own two files.
     pub fn of_files(source: Option<&Path>, target: &Path) -> Result<Self> {
@@ -133,12 +142,9 @@ impl Inputs {
 
     /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
     pub fn with_target_rows(mut self, rows: usize) -> Self {
-        let target = &mut self.target;
-        if rows > 0 && rows < target.rows.len() {
-            target.rows = target.rows.select(&(0..rows).collect::<Vec<_>>());
-            let last = rows - 1;
-            target.rows.timeouts[last] = !target.rows.terminals[last];
-            target.hash = format!("{}, the first {rows} rows", target.hash);
+        if let Some(first) = first_rows(&self.target.rows, rows) {
+            self.target.rows = first;
+            self.target.hash = format!("{}, the first {rows} rows", self.target.hash);
         }
         self
     }
@@ -234,4 +240,32 @@ fn missing(shift: Shift, quality: Quality, agent: Agent, option: &str) -> Error 
              give a file with {option}, or set TCE_SHARED to the folder that holds datasets/otdf and policies"
         ),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fewer_target_rows_are_as_if_the_log_had_ended() {
+        let mut t = Transitions::new(1, 1);
+        (0..10).for_each(|i| t.push(&[i as f32], &[0.0], i as f32, &[i as f32 + 1.0], i == 4, i == 9));
+        let table = |rows: &Transitions| Table { rows: rows.clone(), hash: "h".into(), file: "t.hdf5".into() };
+        let inputs = |rows: usize| {
+            let all = Inputs { agent: None, shift: None, target: table(&t), source: Some(table(&t)) };
+            all.with_target_rows(rows)
+        };
+        let few = inputs(7);
+        assert_eq!(few.target.rows.rewards, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(few.target.rows.episodes().iter().map(|e| e.end).collect::<Vec<_>>(), [5, 7]);
+        assert!(few.target.rows.timeouts[6] && !few.target.rows.terminals[6]);
+        assert_eq!(few.target.hash, "h, the first 7 rows");
+        // An episode that is over is not cut off.
+        let ended = inputs(5).target.rows;
+        assert!(ended.terminals[4] && !ended.timeouts[4]);
+        for rows in [0, 10, 11] {
+            assert_eq!((inputs(rows).target.rows.len(), inputs(rows).target.hash.as_str()), (10, "h"), "{rows}");
+        }
+        assert_eq!(few.source.unwrap().rows.len(), 10, "the source stays");
+    }
 }

@@ -2,12 +2,13 @@
 
 mod common;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use common::{TINY, data_pair, message, tce, tce_json};
+use common::{TINY, data_pair, message, random_rows, tce, tce_json};
 use serde_json::Value;
-use tce_data::{Agent, Shift};
+use tce_data::{Agent, Shift, save_d4rl};
 
 const FEW: &[&str] =
     &["--rows", "200", "--y-max", "0,0.5", "--transition-steps", "40", "--value-steps", "20", "--abundant", "400"];
@@ -56,7 +57,7 @@ fn a_run_is_measured_and_its_report_shows_it() {
     for bound in ["transition", "value", "transition_alone", "value_alone"] {
         assert_eq!(found["theorem"][bound]["nearest"].as_array().unwrap().len(), 10, "{bound}");
     }
-    assert!(found["choice"]["lambda"].is_number() && found["memorisation"]["probability"].is_number());
+    assert!(found["choice"]["lambda"].is_number() && at(&found, 0.2)["memorisation"]["probability"].is_number());
     assert!(found["transitions"]["groups"].as_array().unwrap().len() == 4);
 
     // The same bytes with two threads, elsewhere; and at once where it is done.
@@ -78,6 +79,11 @@ fn a_run_is_measured_and_its_report_shows_it() {
         assert!(message(&output).contains(expected), "{}", message(&output));
     };
     refused(&diagnose(&plain, &[]), 2, "found mixture.generated = None, expected \"tce\"");
+    refused(
+        &["diagnose", &og, "--transition-steps", "0"].map(str::to_owned),
+        2,
+        "--transition-steps 0: expected at least 1",
+    );
     refused(&diagnose("out/nothing", &[]), 1, "spec.json: no such file; give the directory of a finished run");
     refused(&diagnose(&og, &["--seed", "7"]), 2, "the run's seeds are [0]");
     refused(&diagnose(&og, &["--set", "learner.steps=1"]), 2, "a run has its configuration");
@@ -95,7 +101,7 @@ fn two_files_of_ones_own_need_no_simulator() {
     let found = tce_json(dir.path(), &args);
     assert!(found["task"].is_null() && found["choice"]["lambda"].is_number());
     assert!(at(&found, 0.0)["kept"]["transition_kl"].is_null(), "no abundant rows without a simulator");
-    assert!(found["theorem"]["value"].is_null() && found["theorem"]["value_alone"]["generated"].is_number());
+    assert!(found["theorem"]["value"].is_null() && found["theorem"]["value_alone"]["generated"]["rows"].as_u64() > Some(0));
     let note = found["notes"][0].as_str().unwrap();
     assert!(note.contains("Without the simulator"), "{note}");
 
@@ -106,4 +112,68 @@ fn two_files_of_ones_own_need_no_simulator() {
     let output = tce(dir.path(), &args);
     assert_eq!(output.status.code(), Some(2));
     assert!(message(&output).contains("found 50 target rows, expected at least 100"), "{}", message(&output));
+}
+
+/// The wiring of Theorem 1 with a known answer: source rows that the target's dynamics made are at no distance from them, and the
+/// simulator takes all of them (λ = 1), while rows of the other dynamics are.
+#[test]
+fn source_rows_of_the_targets_dynamics_have_no_discrepancy() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let same = dir.path().join("same.hdf5");
+    save_d4rl(&same, &random_rows(Agent::Hopper, Shift::Morph, 1500, 3), &BTreeMap::new(), &[]).unwrap();
+    let diagnosed = |source: &Path, out: &str| {
+        let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+        let run = [
+            &["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--out", out][..],
+            &data,
+            TINY,
+        ]
+        .concat();
+        let run = tce_json(dir.path(), &run);
+        let place = run["rows"][0]["directory"].as_str().unwrap();
+        tce_json(dir.path(), &[&["diagnose", place][..], &data, FEW].concat())
+    };
+    let source_gap = |found: &Value| found["theorem"]["value"]["nearest"][9].as_f64().unwrap();
+    let generated = |found: &Value| found["theorem"]["value"]["nearest"][0].as_f64().unwrap();
+    let (same, other) = (diagnosed(&same, "same"), diagnosed(&source, "other"));
+    assert!(source_gap(&same) < 1e-3 * generated(&same), "{}", same["theorem"]["value"]);
+    assert!(source_gap(&other) > 1e-2 * generated(&other), "{}", other["theorem"]["value"]);
+    assert_eq!(same["choice_by_simulator"]["lambda"], 1.0);
+    assert_eq!(same["choice_by_simulator"]["told"], true);
+}
+
+/// One of two seeds is looked at, and not the other.
+#[test]
+fn the_seed_asked_for_is_the_one_that_is_measured() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+    let run =
+        ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--seeds", "2", "--out", "out"];
+    let run = tce_json(dir.path(), &[&run[..], &data, TINY].concat());
+    let place = run["rows"][0]["directory"].as_str().unwrap();
+    // What the label models of each seed got wrong on their own held-out rows.
+    let stages = fs::read_dir(dir.path().join("out/stages")).unwrap().map(|e| e.unwrap().path());
+    let labels = stages.into_iter().find(|p| p.file_name().unwrap().to_str().unwrap().starts_with("labels-")).unwrap();
+    let done: Value = serde_json::from_slice(&fs::read(labels.join("done.json")).unwrap()).unwrap();
+    for seed in [0, 1] {
+        let name = seed.to_string();
+        let found = tce_json(dir.path(), &[&["diagnose", place, "--seed", &name][..], &data, FEW].concat());
+        assert_eq!(found["seed"], seed);
+        let expected = &done["summary"][seed]["action_rmse"];
+        assert!(expected.is_number() && found["labels"]["held_out_action"][0] == *expected, "{found}");
+    }
+}
+
+/// A filter that leaves nothing is refused by name, before anything is trained.
+#[test]
+fn a_filter_that_rejects_everything_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let files = ["diagnose", "--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+    let args = [&files[..], FEW, TINY, &["--set", "filter.z_threshold=0.1"]].concat();
+    let output = tce(dir.path(), &args);
+    assert_eq!(output.status.code(), Some(1), "{}", message(&output));
+    assert!(message(&output).contains("the filter rejected all 200 generated rows"), "{}", message(&output));
 }

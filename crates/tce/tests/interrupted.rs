@@ -168,6 +168,16 @@ fn rivals_killed_anywhere_learn_the_same() {
 }
 
 #[test]
+fn a_diagnosis_killed_anywhere_measures_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
+    let files = ["diagnose", "--source", "source.hdf5", "--target", "target.hdf5", "--out", "runs"];
+    let few =
+        ["--rows", "200", "--y-max", "0", "--transition-steps", "100", "--value-steps", "100", "--abundant", "400"];
+    kill_loop(dir.path(), &[&files[..], &few, SMALL].concat(), "runs", kills(10), 4);
+}
+
+#[test]
 fn an_agent_killed_anywhere_learns_the_same() {
     let dir = tempfile::tempdir().unwrap();
     let args = [

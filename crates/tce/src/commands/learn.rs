@@ -12,6 +12,7 @@ use tce_nn::cpu;
 use crate::actors::Arena;
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
+use crate::inputs::first_rows;
 use crate::layers::ConfigArgs;
 use crate::learning::{Learned, MemberData, learn};
 use crate::methods::{Method, row_scores};
@@ -86,6 +87,7 @@ impl Learn {
             Ok(Arc::new(loaded.transitions))
         };
         let target = read(&target_file)?;
+        let target = first_rows(&target, config.target.rows).map_or(target, Arc::new);
         let extra = self.extra.as_ref().map(read).transpose()?;
         if let Some(extra) = &extra {
             ensure_same_agent(extra, &target)?;
