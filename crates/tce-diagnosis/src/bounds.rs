@@ -266,8 +266,8 @@ mod tests {
         let doubt: Vec<f64> = (0..1000).map(|i| if (400..600).contains(&i) { 0.5 } else { 9.0 }).collect();
         let generated = Rated { gap: vec![4.0, 6.0], doubt: vec![0.1, 0.3] };
         let curve = Curve::of(&Rated { gap, doubt }, &generated).unwrap();
-        let (se_between, se_generated) = (1.0 / 199f64.sqrt(), 1.0);
-        let expected = 0.2 * (0.5 + 0.2 + (se_between * se_between + se_generated * se_generated as f64).sqrt());
+        // Squares of the standard errors: 1 / 199 between, 1 / 1 of the two generated rows.
+        let expected = 0.2 * (0.5 + 0.2 + (1.0 / 199.0 + 1.0f64).sqrt());
         let at = |lambda: f64| GRID.iter().position(|l| *l == lambda).unwrap();
         assert!((curve.doubt_between(at(0.4), at(0.6)) - expected).abs() < 1e-12);
         assert!((curve.nearest[at(0.6)] - curve.nearest[at(0.4)] - 0.2 * (2.0 - 5.0)).abs() < 1e-12);

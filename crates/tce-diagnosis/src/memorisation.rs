@@ -210,7 +210,8 @@ mod tests {
         for (found, expected) in held_out.distances.concat().iter().zip([5.0, 4.9, 4.0, 3.8, 3.8]) {
             assert!((found - expected).abs() < 1e-6);
         }
-        assert!(HeldOut::new(rows.clone(), 1, vec![0..5]).unwrap().is_none());
+        let one = std::iter::once(0..5).collect();
+        assert!(HeldOut::new(rows.clone(), 1, one).unwrap().is_none());
         assert!(HeldOut::new(rows, 1, vec![0..3, 3..5]).unwrap().is_none(), "two rows are too few to compare with");
         assert!(held_out.judge(&[], &Streams::new(0)).unwrap().is_none());
     }

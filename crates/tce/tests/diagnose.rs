@@ -101,7 +101,9 @@ fn two_files_of_ones_own_need_no_simulator() {
     let found = tce_json(dir.path(), &args);
     assert!(found["task"].is_null() && found["choice"]["lambda"].is_number());
     assert!(at(&found, 0.0)["kept"]["transition_kl"].is_null(), "no abundant rows without a simulator");
-    assert!(found["theorem"]["value"].is_null() && found["theorem"]["value_alone"]["generated"]["rows"].as_u64() > Some(0));
+    assert!(
+        found["theorem"]["value"].is_null() && found["theorem"]["value_alone"]["generated"]["rows"].as_u64() > Some(0)
+    );
     let note = found["notes"][0].as_str().unwrap();
     assert!(note.contains("Without the simulator"), "{note}");
 
