@@ -134,7 +134,7 @@ pub struct Comparison {
     pub tasks: Vec<Task>,
     /// Methods, in the order of the study.
     pub methods: Vec<Aggregate>,
-    /// Methods that have none of these tasks, by place.
+    /// Methods that lack too many tasks, by place.
     pub left_out: Vec<usize>,
     /// Floors in it, by place among the methods.
     pub floors: Vec<usize>,
@@ -385,8 +385,8 @@ fn shift_table(
     Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against })
 }
 
-/// Methods on the tasks that all of them have. Where no task has all methods, the method with the fewest tasks is left out,
-/// one after the other, a floor last of all, until the others share one.
+/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method has, the method with the fewest
+/// tasks is left out, one after the other, a floor last of all: a beginning of one method must not take the others' results away.
 fn compare(
     study: &Study,
     bootstrap: &Bootstrap,
@@ -399,7 +399,8 @@ fn compare(
     let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
     let shared =
         |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
-    while shared(&kept).is_empty() {
+    let most = kept.iter().map(|m| count(*m)).max().unwrap_or(0);
+    while 2 * shared(&kept).len() < most.max(1) {
         let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].floor, std::cmp::Reverse(**m)))
         else {
             return Ok(None);
@@ -607,7 +608,7 @@ fn warnings(
             if !c.left_out.is_empty() {
                 warn(
                     format!(
-                        "Not in the aggregates, for lack of scores on the compared tasks: {}.",
+                        "Not in the aggregates, for lack of scores on more than half of the tasks: {}.",
                         list(c.left_out.iter().map(|m| title(*m)))
                     ),
                     Vec::new(),

@@ -886,7 +886,7 @@ fn methods(analysis: &Analysis) -> Markup {
             b { "Missing and failed runs. " }
             "A run that is not done, or whose files are not what they were, is counted nowhere, and listed above. A policy that diverged \
              is a result: it counts as 0 points, a random policy's score. Methods are compared only on tasks that all of them have; where \
-             no task has all methods, the method with the fewest tasks is left out, and named. With unequal numbers of seeds every task \
+             that is fewer than half of what the fullest method has, the method with the fewest tasks is left out, and named. With unequal numbers of seeds every task \
              keeps its weight, and its runs share it."
         }
         p {

@@ -299,6 +299,28 @@ fn methods_without_a_common_task_are_left_out_by_name() {
     assert!(warned(&analysis, "Not in the aggregates"));
 }
 
+/// A method that has just begun does not take the others' tasks away.
+#[test]
+fn a_beginning_does_not_shrink_the_comparison() {
+    let root = tempfile::tempdir().unwrap();
+    let mut study = study(root.path());
+    let runs = study.runs.clone();
+    for (agent, quality) in [
+        (Agent::Hopper, Quality::Medium),
+        (Agent::Ant, Quality::Expert),
+        (Agent::Hopper, Quality::MediumExpert),
+        (Agent::Ant, Quality::MediumExpert),
+    ] {
+        let more = runs.iter().filter(|r| r.method != "evil" && r.task.agent == agent).cloned();
+        study.runs.extend(more.map(|r| Run { task: task(agent, quality), ..r }));
+    }
+    study.runs.retain(|r| r.method != "evil" || r.task.agent == Agent::Ant);
+    let (analysis, _) = page(&study);
+    let c = analysis.comparison.as_ref().unwrap();
+    assert_eq!((c.left_out.as_slice(), c.tasks.len()), ([5].as_slice(), 6));
+    assert!(warned(&analysis, "Not in the aggregates, for lack of scores on more than half of the tasks"));
+}
+
 #[test]
 fn one_seed_has_no_interval_and_no_finding() {
     let root = tempfile::tempdir().unwrap();
