@@ -215,11 +215,14 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
         let [iqm, ..] = a.over_seeds;
         Some(format!(
             "{}: interquartile mean {}. One of its runs outscores one of the best floor's with probability {} \
-             (permutation test: p = {}); {closing}",
+             (permutation test: p{}); {closing}",
             title(a.method),
             said(&iqm, 1),
             said(&p, 2),
-            p_value(a),
+            match p_value(a) {
+                bound if bound.starts_with('<') => bound.replace('<', " < "),
+                value => format!(" = {value}"),
+            },
         ))
     };
     html! {
