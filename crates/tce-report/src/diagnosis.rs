@@ -455,7 +455,6 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let list = |values: Vec<String>| values.join(", ");
     html! {
         h3 { "λ from the data alone" }
         p {
@@ -482,7 +481,9 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
                             td { (plain(choice.least)) }
                             td class="text" { (d.choice_by_simulator.as_ref().map_or("–".into(), chosen)) }
                             td class="edge text" {
-                                (list(mixed.iter().map(|m| format!("{} {}: {} ({})", m.title, plain(m.lambda), minus(format!("{:.1}", m.score)), counted(m.seeds, "seed", "seeds"))).collect()))
+                                @for m in &mixed {
+                                    div { (m.title) ", λ = " (plain(m.lambda)) ": " (minus(format!("{:.1}", m.score))) " (" (counted(m.seeds, "seed", "seeds")) ")" }
+                                }
                             }
                             td class="text" { @match best { Some(m) => { "λ = " (plain(m.lambda)) ", " (m.title) }, None => "–" } }
                         }
