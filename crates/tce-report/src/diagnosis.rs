@@ -431,8 +431,11 @@ fn mixtures(study: &Study, analysis: &Analysis, task: Task) -> Vec<Mixed> {
             seeds: cell.seeds,
         })
     };
-    let all: Vec<Mixed> = analysis.methods.iter().enumerate().filter_map(of).collect();
-    // Runs that differ in anything else say nothing of λ: the most of one kind, those of the first method among equals.
+    alike(analysis.methods.iter().enumerate().filter_map(of).collect())
+}
+
+/// Those that differ in λ alone: the most of one kind, those of the first method among equals. The others say nothing of λ.
+fn alike(all: Vec<Mixed>) -> Vec<Mixed> {
     let like = |rest: &toml::Table| all.iter().filter(|m| m.rest == *rest).count();
     let most = all.iter().map(|m| like(&m.rest)).max().unwrap_or(0);
     let Some(rest) = all.iter().find(|m| like(&m.rest) == most).map(|m| m.rest.clone()) else { return all };
@@ -524,5 +527,37 @@ fn explanation() -> Markup {
                  that tells rows apart."
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hindsight_compares_what_differs_in_lambda_alone() {
+        let mixed = |title: &str, config: &str| Mixed {
+            rest: without_mixture(toml::from_str(config).unwrap()),
+            lambda: 0.0,
+            title: title.into(),
+            score: 0.0,
+            seeds: 1,
+        };
+        let titles = |all| alike(all).into_iter().map(|m| m.title).collect::<Vec<_>>();
+        let og =
+            || mixed("og", "generator.y_max = 0.2\nmixture = { generated = 'tce', source = 'none', lambda = 0.0 }");
+        let nn =
+            || mixed("nn", "generator.y_max = 0.2\nmixture = { generated = 'tce', source = 'nearest', lambda = 0.1 }");
+        let wide =
+            || mixed("wide", "generator.y_max = 0.5\nmixture = { generated = 'tce', source = 'none', lambda = 0.0 }");
+        let weighed = || {
+            mixed(
+                "x",
+                "generator.y_max = 0.2\nmixture = { generated = 'tce', source = 'none', lambda = 0.0, weight = 2 }",
+            )
+        };
+        assert_eq!(titles(vec![wide(), og(), weighed(), nn()]), ["og", "nn"]);
+        assert_eq!(titles(vec![wide(), og()]), ["wide"], "nothing to compare");
+        assert!(titles(vec![]).is_empty());
     }
 }
