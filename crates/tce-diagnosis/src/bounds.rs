@@ -167,6 +167,11 @@ impl Curve {
     }
 }
 
+/// What u is multiplied by, given mean d and u of held-out rows, whose true discrepancy is 0: their ratio, but never less than 1.
+pub fn calibration((d, u): (f64, f64)) -> f64 {
+    if u > 0.0 { (d / u).max(1.0) } else { 1.0 }
+}
+
 /// Both bounds, as far as they can be measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Bounds {
@@ -182,16 +187,11 @@ pub struct Bounds {
     pub transition_alone: Option<Curve>,
     /// See `transition_alone`; what the rule looks at.
     pub value_alone: Option<Curve>,
-    /// Mean d and u of target rows by models that did not see them: u is multiplied by their ratio if it is above 1.
-    pub held_out: Option<(f64, f64)>,
+    /// Mean d and u of target rows, d by models that did not see them: what [`calibration`] is made from.
+    pub held_out: (f64, f64),
 }
 
 impl Bounds {
-    /// What u is multiplied by.
-    pub fn calibration(&self) -> f64 {
-        self.held_out.map_or(1.0, |(d, u)| if u > 0.0 { (d / u).max(1.0) } else { 1.0 })
-    }
-
     /// 2γ r_max / (1 − γ)²
     pub fn transition_factor(&self) -> f64 {
         2.0 * self.discount * self.r_max / (1.0 - self.discount).powi(2)
@@ -314,7 +314,7 @@ mod tests {
             value: None,
             transition_alone: None,
             value_alone: None,
-            held_out: None,
+            held_out: (0.0, 0.0),
         };
         assert!((bounds.transition_factor() - 99_000.0).abs() < 1e-6);
         assert!((bounds.value_factor() - 99.0).abs() < 1e-9);

@@ -53,9 +53,14 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
+    /// The figures at one y_max.
+    pub fn at(&self, y_max: f64) -> Option<&AtBound> {
+        self.bounds_of_y.iter().find(|b| (b.y_max - y_max).abs() < 1e-9)
+    }
+
     /// The figures at the run's own y_max.
     pub fn at_own_bound(&self) -> Option<&AtBound> {
-        self.bounds_of_y.iter().find(|b| (b.y_max - self.y_max).abs() < 1e-9)
+        self.at(self.y_max)
     }
 }
 
@@ -85,9 +90,9 @@ pub struct Reliability {
     pub rows: usize,
     /// Distance of ŝ to the nearest state of source and target (Fig. 3 b.1).
     pub distance: Option<Spread>,
-    /// KL between the transition models of the 5k and of abundant target rows at (ŝ, â), nats per dimension (Fig. 3 b.2).
+    /// KL between the transition models of the run's and of abundant target rows at (ŝ, â), nats per dimension (Fig. 3 b.2).
     pub transition_kl: Option<Spread>,
-    /// |difference| of the reward models of the 5k and of abundant target rows at (ŝ, ŝ') (Fig. 3 b.3).
+    /// |difference| of the reward models of the run's and of abundant target rows at (ŝ, ŝ') (Fig. 3 b.3).
     pub reward_difference: Option<Spread>,
     /// |r̂ − r| with r of the simulator at (ŝ, â).
     pub reward_error: Option<Spread>,

@@ -72,9 +72,8 @@ fn percent(share: f64) -> String {
 
 /// The diagnosis in a few sentences.
 fn lede(d: &Diagnosis) -> String {
-    let at = |y: f64| d.bounds_of_y.iter().find(|b| (b.y_max - y).abs() < 1e-9);
     let mut text = String::new();
-    if let (Some(zero), Some(own)) = (at(0.0), at(d.y_max)) {
+    if let (Some(zero), Some(own)) = (d.at(0.0), d.at_own_bound()) {
         let target = |c: Option<Coverage>| c.map_or("–".into(), |c| percent(c.target));
         let source = |c: Option<Coverage>| c.and_then(|c| c.source).map_or("–".into(), percent);
         text += &format!(
@@ -379,10 +378,8 @@ fn table(d: &Diagnosis) -> Markup {
             let all = [c.generated.mean_doubt(), c.source(1).mean_doubt(), whole.mean_doubt()].map(number).join(" / ");
             rows.push(("Doubt of the latter: how far models that lack a third of the episodes are apart", all));
         }
-        if let Some((gap, doubt)) = b.held_out {
-            let text = "|ΔV| of target rows by models that lack them / how far the models are apart there";
-            rows.push((text, format!("{} / {}", number(gap), number(doubt))));
-        }
+        let text = "|ΔV| of target rows by models that lack them / how far the models are apart there";
+        rows.push((text, format!("{} / {}", number(b.held_out.0), number(b.held_out.1))));
     }
     if let Some(c) = &d.choice {
         rows.push(("λ of the rule, from the data alone", chosen(c)));
@@ -437,8 +434,8 @@ fn mixtures(study: &Study, analysis: &Analysis, task: Task) -> Vec<Mixed> {
 /// Those that differ in λ alone: the most of one kind, those of the first method among equals. The others say nothing of λ.
 fn alike(all: Vec<Mixed>) -> Vec<Mixed> {
     let like = |rest: &toml::Table| all.iter().filter(|m| m.rest == *rest).count();
-    let most = all.iter().map(|m| like(&m.rest)).max().unwrap_or(0);
-    let Some(rest) = all.iter().find(|m| like(&m.rest) == most).map(|m| m.rest.clone()) else { return all };
+    // The first of the greatest: `max_by_key` takes the last.
+    let Some(rest) = all.iter().rev().max_by_key(|m| like(&m.rest)).map(|m| m.rest.clone()) else { return all };
     all.into_iter().filter(|m| m.rest == rest).collect()
 }
 

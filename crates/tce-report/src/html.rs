@@ -186,12 +186,12 @@ fn warnings(analysis: &Analysis) -> Markup {
     }
 }
 
-/// Two digits, or a bound.
-fn p_value(a: &Aggregate) -> String {
+/// Three digits, or that it is below them.
+fn p_value(a: &Aggregate) -> (bool, String) {
     match a.p_value {
-        None => "–".into(),
-        Some(p) if p < 0.001 => "<0.001".into(),
-        Some(p) => format!("{p:.3}"),
+        None => (false, "–".into()),
+        Some(p) if p < 0.001 => (true, "0.001".into()),
+        Some(p) => (false, format!("{p:.3}")),
     }
 }
 
@@ -213,16 +213,14 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
             Finding::Unknown => "with one seed there is no interval.",
         };
         let [iqm, ..] = a.over_seeds;
+        let (below, digits) = p_value(a);
         Some(format!(
             "{}: interquartile mean {}. One of its runs outscores one of the best floor's with probability {} \
-             (permutation test: p{}); {closing}",
+             (permutation test: p {} {digits}); {closing}",
             title(a.method),
             said(&iqm, 1),
             said(&p, 2),
-            match p_value(a) {
-                bound if bound.starts_with('<') => bound.replace('<', " < "),
-                value => format!(" = {value}"),
-            },
+            if below { "<" } else { "=" },
         ))
     };
     html! {
@@ -269,7 +267,8 @@ fn findings(study: &Study, analysis: &Analysis) -> Markup {
                                 (None, _) => {}
                                 (_, Some((e, finding))) => {
                                     td class="edge" { (estimate(&e, 2)) }
-                                    td { (p_value(a)) }
+                                    @let (below, digits) = p_value(a);
+                                    td { @if below { "<" } (digits) }
                                     td class=(format!("text {}", match finding {
                                         Finding::Better => "better", Finding::Worse => "worse", _ => "",
                                     })) { (finding.word()) }

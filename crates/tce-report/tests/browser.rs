@@ -141,7 +141,7 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
             value: curve.clone(),
             transition_alone: curve.clone(),
             value_alone: curve,
-            held_out: Some((0.1, 0.05)),
+            held_out: (0.1, 0.05),
         }),
         notes: vec!["a <note>".into()],
     }

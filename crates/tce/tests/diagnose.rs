@@ -13,6 +13,11 @@ use tce_data::{Agent, Shift, save_d4rl};
 const FEW: &[&str] =
     &["--rows", "200", "--y-max", "0,0.5", "--transition-steps", "40", "--value-steps", "20", "--abundant", "400"];
 
+/// A tiny run on Hopper, as its table tells it.
+fn finished(directory: &Path, data: &[&str], more: &[&str]) -> Value {
+    tce_json(directory, &[&["run", "hopper-morph:medium->expert"], more, data, TINY].concat())
+}
+
 /// The figures at one label bound.
 fn at(diagnosis: &Value, y: f64) -> &Value {
     diagnosis["bounds_of_y"].as_array().unwrap().iter().find(|b| b["y_max"] == y).expect("on the grid")
@@ -29,10 +34,7 @@ fn a_run_is_measured_and_its_report_shows_it() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-    let mut args = vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og,target-source", "--out", "out"];
-    args.extend(data);
-    args.extend(TINY);
-    let run = tce_json(dir.path(), &args);
+    let run = finished(dir.path(), &data, &["--variant", "tce-og,target-source", "--out", "out"]);
     let place = |variant: &str| {
         let rows = run["rows"].as_array().unwrap();
         rows.iter().find(|r| r["variant"] == variant).unwrap()["directory"].as_str().unwrap().to_owned()
@@ -126,13 +128,7 @@ fn source_rows_of_the_targets_dynamics_have_no_discrepancy() {
     save_d4rl(&same, &random_rows(Agent::Hopper, Shift::Morph, 1500, 3), &BTreeMap::new(), &[]).unwrap();
     let diagnosed = |source: &Path, out: &str| {
         let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-        let run = [
-            &["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--out", out][..],
-            &data,
-            TINY,
-        ]
-        .concat();
-        let run = tce_json(dir.path(), &run);
+        let run = finished(dir.path(), &data, &["--variant", "tce-og", "--no-floors", "--out", out]);
         let place = run["rows"][0]["directory"].as_str().unwrap();
         tce_json(dir.path(), &[&["diagnose", place][..], &data, FEW].concat())
     };
@@ -151,9 +147,8 @@ fn the_seed_asked_for_is_the_one_that_is_measured() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-    let run =
-        ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--seeds", "2", "--out", "out"];
-    let run = tce_json(dir.path(), &[&run[..], &data, TINY].concat());
+    let more = ["--variant", "tce-og", "--no-floors", "--seeds", "2", "--out", "out"];
+    let run = finished(dir.path(), &data, &more);
     let place = run["rows"][0]["directory"].as_str().unwrap();
     // What the label models of each seed got wrong on their own held-out rows.
     let stages = fs::read_dir(dir.path().join("out/stages")).unwrap().map(|e| e.unwrap().path());
@@ -168,7 +163,7 @@ fn the_seed_asked_for_is_the_one_that_is_measured() {
     }
 }
 
-/// A filter that leaves nothing is refused by name, before anything is trained.
+/// A filter that leaves nothing is refused by name.
 #[test]
 fn a_filter_that_rejects_everything_is_told() {
     let dir = tempfile::tempdir().unwrap();

@@ -98,7 +98,7 @@ fn every_example_is_a_plan() {
     let mut seen = 0;
     for plan in plans {
         let planned = tce_json(dir.path(), &["sweep", "plan", plan.to_str().unwrap(), "--dry-run"]);
-        assert!(planned["run"].as_u64().unwrap() >= 24, "{}: {planned}", plan.display());
+        assert!(planned["run"].as_u64().unwrap() >= 30, "{}: {planned}", plan.display());
         seen += 1;
     }
     assert!(seen >= 10, "{seen} plans");

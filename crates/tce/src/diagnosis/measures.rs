@@ -5,6 +5,7 @@ use std::path::Path;
 use tce_base::Streams;
 use tce_base::random::choose;
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
+use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Rated, Reliability,
     Sampled, Spread, coverage, gaussian, memorisation,
@@ -17,7 +18,6 @@ use super::rows::{Batch, Sampler};
 use super::{Options, Subject, generator};
 use crate::config::SourceRows;
 use crate::error::Result;
-use crate::expand::everything_rejected;
 use crate::mixture::distances;
 use crate::units::Units;
 
@@ -93,9 +93,7 @@ impl Work<'_> {
         let batches = grid.iter().map(|&y| sampler.sample(options.rows, y, "figures")).collect::<Result<Vec<_>>>()?;
         let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
         let own = &batches[at(config.generator.y_max)];
-        if own.kept() == 0 {
-            return Err(everything_rejected(own.len() + own.lost, &config.filter));
-        }
+        own.ensure_kept(&config.filter)?;
         for (y, batch) in grid.iter().zip(&batches).filter(|(_, b)| b.lost > 0) {
             notes.push(format!(
                 "{} of {} rows generated with y_max = {y} hold numbers that are not finite. They count as rejected, and are part of no \
@@ -117,14 +115,9 @@ impl Work<'_> {
         if references.is_none() {
             notes.push("There are too few rows for a coverage.".into());
         }
-        let covered = |rows: &Transitions| match &references {
-            None => Ok(None),
-            Some(r) => r.covered_by(rows, self.units(), &streams),
-        };
-        let covered_by_target = match &references {
-            None => None,
-            Some(r) => covered(&r.other_target)?,
-        };
+        let covered =
+            |rows: &Transitions| references.as_ref().map_or(Ok(None), |r| r.covered_by(rows, self.units(), &streams));
+        let covered_by_target = references.as_ref().map_or(Ok(None), |r| covered(&r.other_target))?;
         let held_out = self.held_out()?;
         if held_out.is_none() {
             notes.push("One episode has most of the target rows: there are no held-out rows to tell copies by.".into());
@@ -196,13 +189,10 @@ impl Work<'_> {
             if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
         let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
         let measured = pick(&order, "sources");
-        let mut free = vec![true; all.len()];
-        measured.iter().for_each(|&i| free[i] = false);
-        let others: Vec<usize> = (0..all.len()).filter(|&i| free[i]).collect();
         Ok(Some(Sources {
             sorted: all.select(&measured),
             nearest: all.select(&pick(&order[..near], "nearest")),
-            others: all.select(&others),
+            others: without(all, &measured),
         }))
     }
 
@@ -216,15 +206,12 @@ impl Work<'_> {
         let reference =
             |t: &Transitions| coverage::Reference::new(self.units().states(&t.observations), self.units().live.len());
         let chosen = choose(&mut streams.stream("reference/target"), target.len(), rows);
-        let mut free = vec![true; target.len()];
-        chosen.iter().for_each(|&i| free[i] = false);
-        let others: Vec<usize> = (0..target.len()).filter(|&i| free[i]).collect();
         let source = sources.map(|s| reference(&few(&s.sorted, rows, streams, "reference/source"))).transpose()?;
         Ok(Some(References {
             rows,
             target: reference(&target.select(&chosen))?,
             source,
-            other_target: target.select(&others),
+            other_target: without(target, &chosen),
         }))
     }
 
@@ -343,24 +330,21 @@ impl Work<'_> {
                 Curve::of(&gap(&sources.sorted)?, &gap(&generated)?)
             }
         };
-        let held_out = Some(models.held_out(&inputs.target.rows, inputs.agent));
-        let mut bounds = Bounds {
+        let held_out = models.held_out(&inputs.target.rows, inputs.agent);
+        let alone = |t: &Transitions, densities: &[Densities]| {
+            let mut rated = models.value_gap_alone(t, densities, inputs.agent);
+            rated.doubt.iter_mut().for_each(|u| *u *= calibration(held_out));
+            rated
+        };
+        Ok(Bounds {
             discount: config.learner.iql.discount,
             r_max: inputs.target.rows.rewards.iter().fold(0.0, |m, r| f64::from(r.abs()).max(m)),
             transition,
             value,
             transition_alone: tv(models.limited),
-            value_alone: None,
+            value_alone: Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated)),
             held_out,
-        };
-        let calibration = bounds.calibration();
-        let alone = |t: &Transitions, densities: &[Densities]| {
-            let mut rated = models.value_gap_alone(t, densities, inputs.agent);
-            rated.doubt.iter_mut().for_each(|u| *u *= calibration);
-            rated
-        };
-        bounds.value_alone = Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated));
-        Ok(bounds)
+        })
     }
 }
 
@@ -429,6 +413,13 @@ pub fn few(t: &Transitions, count: usize, streams: &Streams, name: &str) -> Tran
         return t.clone();
     }
     t.select(&choose(&mut streams.stream(name), t.len(), count))
+}
+
+/// The rows that are not at `places`, in their order.
+fn without(t: &Transitions, places: &[usize]) -> Transitions {
+    let mut free = vec![true; t.len()];
+    places.iter().for_each(|&i| free[i] = false);
+    t.select(&(0..t.len()).filter(|&i| free[i]).collect::<Vec<_>>())
 }
 
 /// (s, s') of live dimensions in units of the states, `[N, 2 d]`.

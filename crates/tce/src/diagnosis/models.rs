@@ -31,7 +31,7 @@ use crate::error::{Error, Result};
 use crate::stage::Attempt;
 use crate::units::even_standardizer;
 
-/// Fewer source rows than this make no model.
+/// The source's model gets as many rows at least, where there are as many, however few abundant rows are asked for.
 const FEWEST_SOURCES: usize = 1000;
 /// Parts of the target rows, and models that lack one of them.
 const THIRDS: usize = 3;
@@ -86,7 +86,8 @@ impl Models {
         let many = options.abundant / 2;
         // Other rows than those that are measured: a model must not be asked about what it was trained on.
         let generated = work.sampler.sample(many.max(own.len()), config.generator.y_max, "training")?;
-        let generated = generated.some_kept(&config.filter)?.kept_rows();
+        generated.ensure_kept(&config.filter)?;
+        let generated = generated.kept_rows();
         let source = sources.map(|s| few(&s.others, many.max(FEWEST_SOURCES), &streams, "source rows"));
         let (mut at_source, mut at_generated, mut abundant) = (None, None, None);
         if let Some(place) = work.simulator {

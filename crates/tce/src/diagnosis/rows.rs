@@ -58,10 +58,10 @@ impl Batch {
     }
 
     /// Refuses a sample of which the filter leaves nothing: there is nothing to measure, nor to learn from.
-    pub fn some_kept(self, filter: &FilterConfig) -> Result<Self> {
+    pub fn ensure_kept(&self, filter: &FilterConfig) -> Result<()> {
         match self.kept() {
             0 => Err(everything_rejected(self.len() + self.lost, filter)),
-            _ => Ok(self),
+            _ => Ok(()),
         }
     }
 }
