@@ -17,16 +17,22 @@
 //!
 //! ```text
 //! bound(b) − bound(a) = (b − a) (d_between − d_generated)        d_between: rows nearer than b and not than a
-//! ± (b − a) (u_between + u_generated + √(se²_between + se²_generated))
+//! ± (b − a) (u_between + u_generated + q √(se²_between + se²_generated))
 //! ```
 //!
-//! and only a difference beyond its ± is told. The rule takes the smallest λ whose bound is not told from the least one; where that
+//! and only a difference beyond its ± is told. The standard errors count trajectories and not rows: rows of one trajectory are alike. q is the
+//! normal quantile at which nine comparisons that are all of equals tell a difference in one of twenty cases at most (Bonferroni). The rule takes the smallest λ whose bound is not told from the least one; where that
 //! is 0, and not every other λ is told to be worse, the data do not say, and 0 stands as the paper's default.
+
+use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 /// The λ at which curves are computed.
 pub const GRID: [f64; 10] = [0.0, 0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0];
+
+/// q: Φ⁻¹(1 − .05 / (2 · 9)) for the nine λ beside the one that they are compared with.
+const QUANTILE: f64 = 2.773;
 
 /// One discrepancy per row, and how wrong it may be.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,52 +41,56 @@ pub struct Rated {
     pub gap: Vec<f64>,
     /// u of the same rows.
     pub doubt: Vec<f64>,
+    /// The trajectory that each row is of.
+    pub group: Vec<usize>,
 }
 
 impl Rated {
-    /// Without a doubt, as the simulator rates.
+    /// Without a doubt, as the simulator rates, and every row for itself.
     pub fn certain(gap: Vec<f64>) -> Self {
-        Self { doubt: vec![0.0; gap.len()], gap }
+        let rows = gap.len();
+        Self { doubt: vec![0.0; rows], group: (0..rows).collect(), gap }
+    }
+
+    /// The same, rows of the same trajectory together.
+    #[must_use]
+    pub fn grouped(self, group: &[usize]) -> Self {
+        assert_eq!(group.len(), self.gap.len(), "a trajectory for every row");
+        Self { group: group.to_vec(), ..self }
+    }
+
+    fn select(&self, places: impl Iterator<Item = usize> + Clone) -> Self {
+        Self {
+            gap: places.clone().map(|i| self.gap[i]).collect(),
+            doubt: places.clone().map(|i| self.doubt[i]).collect(),
+            group: places.map(|i| self.group[i]).collect(),
+        }
     }
 
     /// The rows whose numbers are finite.
     fn finite(&self) -> Self {
-        let rows = self.gap.iter().zip(&self.doubt).filter(|(d, u)| d.is_finite() && u.is_finite());
-        let (gap, doubt) = rows.unzip();
-        Self { gap, doubt }
+        self.select((0..self.gap.len()).filter(|&i| self.gap[i].is_finite() && self.doubt[i].is_finite()))
     }
 }
 
-/// What is known of the mean discrepancy of some rows. Parts of a whole add up.
+/// Sums over some rows. Parts of a whole add up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Part {
     /// Rows.
     pub rows: usize,
     /// Σ d
     pub sum: f64,
-    /// Σ d²
-    pub squares: f64,
     /// Σ u
     pub doubt: f64,
 }
 
 impl Part {
-    fn of(gap: &[f64], doubt: &[f64]) -> Self {
-        Self {
-            rows: gap.len(),
-            sum: gap.iter().sum(),
-            squares: gap.iter().map(|d| d * d).sum(),
-            doubt: doubt.iter().sum(),
-        }
+    fn of(rated: &Rated) -> Self {
+        Self { rows: rated.gap.len(), sum: rated.gap.iter().sum(), doubt: rated.doubt.iter().sum() }
     }
 
     fn and(self, other: &Self) -> Self {
-        Self {
-            rows: self.rows + other.rows,
-            sum: self.sum + other.sum,
-            squares: self.squares + other.squares,
-            doubt: self.doubt + other.doubt,
-        }
+        Self { rows: self.rows + other.rows, sum: self.sum + other.sum, doubt: self.doubt + other.doubt }
     }
 
     /// Mean d; NaN without rows.
@@ -92,12 +102,19 @@ impl Part {
     pub fn mean_doubt(&self) -> f64 {
         self.doubt / self.rows as f64
     }
+}
 
-    /// The square of the standard error of the mean.
-    fn error_squared(&self) -> f64 {
-        let (n, mean) = (self.rows as f64, self.mean());
-        ((self.squares / n - mean * mean).max(0.0)) / (n - 1.0).max(1.0)
+/// The square of the standard error of the mean d, c / (c − 1) Σ (Σ (d − mean))² / n², the inner sum over the rows of each of c trajectories.
+/// None for a single trajectory: it says nothing of others.
+fn error_squared(rated: &Rated) -> Option<f64> {
+    let n = rated.gap.len() as f64;
+    let mean = rated.gap.iter().sum::<f64>() / n;
+    let mut sums = BTreeMap::<usize, f64>::new();
+    for (d, group) in rated.gap.iter().zip(&rated.group) {
+        *sums.entry(*group).or_default() += d - mean;
     }
+    let c = sums.len() as f64;
+    (sums.len() > 1).then(|| c / (c - 1.0) * sums.values().map(|s| s * s).sum::<f64>() / (n * n))
 }
 
 /// λ d_source(λ) + (1 − λ) d_generated for every λ of [`GRID`].
@@ -111,6 +128,11 @@ pub struct Curve {
     pub parts: Vec<Part>,
     /// The generated rows.
     pub generated: Part,
+    /// The square of the standard error of the mean of the source rows between the places a < b of the grid, at [a][b − a − 1]; None where they
+    /// are of one trajectory.
+    pub errors: Vec<Vec<Option<f64>>>,
+    /// The same of the generated rows.
+    pub generated_error: Option<f64>,
     /// Rows whose discrepancy is not a finite number, and which are left out: source and generated ones.
     pub lost: (usize, usize),
 }
@@ -123,16 +145,17 @@ impl Curve {
             return None;
         }
         let lost = (sources.gap.len() - s.gap.len(), generated.gap.len() - g.gap.len());
-        let rows = |k: usize| ((GRID[k] * s.gap.len() as f64).round() as usize).max(k.min(1));
-        let part = |k: usize| {
-            let places = if k == 0 { 0..0 } else { rows(k - 1)..rows(k) };
-            Part::of(&s.gap[places.clone()], &s.doubt[places])
-        };
+        let rows = |k: usize| if k == 0 { 0 } else { ((GRID[k] * s.gap.len() as f64).round() as usize).max(1) };
+        let between = |a: usize, b: usize| s.select(rows(a)..rows(b));
+        let part = |k: usize| if k == 0 { Part::default() } else { Part::of(&between(k - 1, k)) };
+        let errors = |a: usize| (a + 1..GRID.len()).map(|b| error_squared(&between(a, b))).collect();
         let mut curve = Self {
             nearest: vec![],
             all: vec![],
             parts: (0..GRID.len()).map(part).collect(),
-            generated: Part::of(&g.gap, &g.doubt),
+            generated: Part::of(&g),
+            errors: (0..GRID.len()).map(errors).collect(),
+            generated_error: error_squared(&g),
             lost,
         };
         let (generated, whole) = (curve.generated.mean(), curve.source(GRID.len() - 1).mean());
@@ -153,21 +176,22 @@ impl Curve {
         self.parts[a + 1..=b].iter().fold(Part::default(), Part::and)
     }
 
-    /// How far `nearest` at two places a < b of [`GRID`] has to differ for the difference to be told.
-    pub fn doubt_between(&self, a: usize, b: usize) -> f64 {
+    /// How far `nearest` at two places a < b of [`GRID`] has to differ for the difference to be told; None where no difference could be.
+    pub fn doubt_between(&self, a: usize, b: usize) -> Option<f64> {
         let (part, g) = (self.between(a, b), &self.generated);
         // Two places may share their rows where there are few.
-        let (doubt, error) = if part.rows == 0 { (0.0, 0.0) } else { (part.mean_doubt(), part.error_squared()) };
-        (GRID[b] - GRID[a]) * (doubt + g.mean_doubt() + (error + g.error_squared()).sqrt())
+        let (doubt, error) = if part.rows == 0 { (0.0, 0.0) } else { (part.mean_doubt(), self.errors[a][b - a - 1]?) };
+        Some((GRID[b] - GRID[a]) * (doubt + g.mean_doubt() + QUANTILE * (error + self.generated_error?).sqrt()))
     }
 
     /// Whether the bound at place `a` is told to be greater than the one at `b`.
     fn told_worse(&self, a: usize, b: usize) -> bool {
-        self.nearest[a] - self.nearest[b] > self.doubt_between(a.min(b), a.max(b))
+        self.doubt_between(a.min(b), a.max(b)).is_some_and(|doubt| self.nearest[a] - self.nearest[b] > doubt)
     }
 }
 
-/// What u is multiplied by, given mean d and u of held-out rows, whose true discrepancy is 0: their ratio, but never less than 1.
+/// What u is multiplied by, given mean d and u of held-out rows, whose true discrepancy is 0: their ratio, but never less than 1. u of a
+/// held-out row has to be that between models of which one at least has not seen it: models that have seen a row agree.
 pub fn calibration((d, u): (f64, f64)) -> f64 {
     if u > 0.0 { (d / u).max(1.0) } else { 1.0 }
 }
@@ -187,7 +211,8 @@ pub struct Bounds {
     pub transition_alone: Option<Curve>,
     /// See `transition_alone`; what the rule looks at.
     pub value_alone: Option<Curve>,
-    /// Mean d and u of target rows, d by models that did not see them: what [`calibration`] is made from.
+    /// Of target rows by models that did not see them: mean d, and how far those are from the models that did, what [`calibration`] is made
+    /// from.
     pub held_out: (f64, f64),
 }
 
@@ -255,8 +280,23 @@ mod tests {
         assert!((curve.nearest[at(0.8)] - (0.8 * d + 0.2 * 0.4)).abs() < 1e-12);
         assert!((curve.all[at(0.4)] - (0.4 * 0.6 + 0.6 * 0.4)).abs() < 1e-12);
         assert_eq!((curve.lost, curve.parts.iter().map(|p| p.rows).sum::<usize>()), ((1, 1), 1000));
-        assert!((curve.generated.error_squared() - 0.01).abs() < 1e-12, "two rows at ±.1");
+        assert!((curve.generated_error.unwrap() - 0.01).abs() < 1e-12, "two rows at ±.1");
         assert_eq!(Curve::of(&Rated::default(), &Rated::certain(vec![1.0])), None);
+    }
+
+    /// 100 rows of four trajectories are four numbers, and one trajectory is none.
+    #[test]
+    fn rows_of_a_trajectory_count_once() {
+        let gap: Vec<f64> = (0..100).map(|i| f64::from(i / 25)).collect();
+        let group: Vec<usize> = (0..100).map(|i| i / 25).collect();
+        let four = error_squared(&Rated::certain(gap.clone()).grouped(&group)).unwrap();
+        let expected = error_squared(&Rated::certain(vec![0.0, 1.0, 2.0, 3.0])).unwrap();
+        assert!((four - expected).abs() < 1e-12 && (expected - 5.0 / 12.0).abs() < 1e-12);
+        assert!(error_squared(&Rated::certain(gap.clone())).unwrap() < expected / 20.0);
+        assert_eq!(error_squared(&Rated::certain(gap).grouped(&[7; 100])), None);
+        let single = Rated::certain(vec![0.1; 1000]).grouped(&[7; 1000]);
+        let choice = Choice::of(&Curve::of(&single, &Rated::certain(vec![5.0; 1000])).unwrap());
+        assert_eq!((choice.lambda, choice.told, choice.least), (0.0, false, 1.0));
     }
 
     /// The ± of the module's words, on numbers worked by hand: between .4 and .6 lie 200 rows, half at 1 and half at 3.
@@ -264,12 +304,12 @@ mod tests {
     fn differences_are_doubted_by_the_rows_between() {
         let gap: Vec<f64> = (0..1000).map(|i| if i % 2 == 0 { 1.0 } else { 3.0 }).collect();
         let doubt: Vec<f64> = (0..1000).map(|i| if (400..600).contains(&i) { 0.5 } else { 9.0 }).collect();
-        let generated = Rated { gap: vec![4.0, 6.0], doubt: vec![0.1, 0.3] };
-        let curve = Curve::of(&Rated { gap, doubt }, &generated).unwrap();
+        let generated = Rated { gap: vec![4.0, 6.0], doubt: vec![0.1, 0.3], group: vec![0, 1] };
+        let curve = Curve::of(&Rated { gap, doubt, group: (0..1000).collect() }, &generated).unwrap();
         // Squares of the standard errors: 1 / 199 between, 1 / 1 of the two generated rows.
-        let expected = 0.2 * (0.5 + 0.2 + (1.0 / 199.0 + 1.0f64).sqrt());
+        let expected = 0.2 * (0.5 + 0.2 + 2.773 * (1.0 / 199.0 + 1.0f64).sqrt());
         let at = |lambda: f64| GRID.iter().position(|l| *l == lambda).unwrap();
-        assert!((curve.doubt_between(at(0.4), at(0.6)) - expected).abs() < 1e-12);
+        assert!((curve.doubt_between(at(0.4), at(0.6)).unwrap() - expected).abs() < 1e-12);
         assert!((curve.nearest[at(0.6)] - curve.nearest[at(0.4)] - 0.2 * (2.0 - 5.0)).abs() < 1e-12);
     }
 
@@ -293,15 +333,13 @@ mod tests {
     /// Models that guess at the source's rows do not decide between them and generated ones.
     #[test]
     fn what_models_guess_does_not_count() {
-        let generated = Rated { gap: vec![0.4; 1000], doubt: vec![0.3; 1000] };
-        let rated = |gap: f64, doubt: f64| {
-            Choice::of(&Curve::of(&Rated { gap: vec![gap; 1000], doubt: vec![doubt; 1000] }, &generated).unwrap())
-        };
+        let rows = |gap: f64, doubt: f64| Rated { doubt: vec![doubt; 1000], ..Rated::certain(vec![gap; 1000]) };
+        let rated = |gap: f64, doubt: f64| Choice::of(&Curve::of(&rows(gap, doubt), &rows(0.4, 0.3)).unwrap());
         assert_eq!((rated(160.0, 150.0).lambda, rated(160.0, 150.0).told), (0.0, true));
         assert_eq!((rated(160.0, 165.0).lambda, rated(160.0, 165.0).told), (0.0, false));
         assert_eq!((rated(0.2, 0.1).lambda, rated(0.2, 0.1).told), (0.0, false), "less than .4 in doubt");
         let sure = Rated::certain(vec![0.4; 1000]);
-        let near = Curve::of(&Rated { gap: vec![0.2; 1000], doubt: vec![0.1; 1000] }, &sure).unwrap();
+        let near = Curve::of(&rows(0.2, 0.1), &sure).unwrap();
         assert_eq!((Choice::of(&near).lambda, Choice::of(&near).told), (1.0, true));
     }
 

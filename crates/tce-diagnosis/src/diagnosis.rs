@@ -30,7 +30,8 @@ pub struct Diagnosis {
     pub target_rows: usize,
     /// States of each domain that coverage is counted over, and covering rows; those are no reference rows.
     pub coverage_rows: usize,
-    /// Coverage by the target rows themselves: what there is without any expansion. None where rows are too few.
+    /// Coverage by target rows of other episodes (of the same ones where they cannot be split, see `notes`): what fresh target rows
+    /// cover. None where rows are too few.
     pub covered_by_target: Option<Coverage>,
     /// Figures over y_max, ascending.
     pub bounds_of_y: Vec<AtBound>,

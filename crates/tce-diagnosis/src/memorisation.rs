@@ -15,7 +15,7 @@
 //! | beside the data | towards 0 |
 //!
 //! The measure needs episodes that visit the same states, as the gait of one policy does. Where every episode is a place of its own,
-//! fresh rows get the p of copies, and [`Memorisation::identical`] alone tells them apart.
+//! fresh rows get the p of copies, and only exact copies are told from them, by [`Memorisation::identical`].
 
 use std::ops::Range;
 
@@ -28,6 +28,8 @@ use crate::numbers::Spread;
 
 /// Below this p generated rows are said to lie beside the data: three of four are farther from a training row than a held-out row is.
 pub const BESIDE: f64 = 0.25;
+/// From this share of identical rows on rows are said to be copies, whatever p is: chance makes none among continuous numbers.
+pub const IDENTICAL: f64 = 0.01;
 
 /// How near generated rows are to training rows, beside rows that the generator did not see.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,10 +59,11 @@ pub enum Verdict {
 }
 
 impl Memorisation {
-    /// What p says: copies from half the way between ½ and what copies get, beside the data below [`BESIDE`].
+    /// What p says: copies from half the way between ½ and what copies get or from [`IDENTICAL`] exact ones on, beside the data below
+    /// [`BESIDE`].
     pub fn verdict(&self) -> Verdict {
         match self.probability {
-            p if p > (0.5 + self.of_copies) / 2.0 => Verdict::Copies,
+            p if p > (0.5 + self.of_copies) / 2.0 || self.identical >= IDENTICAL => Verdict::Copies,
             p if p < BESIDE => Verdict::Beside,
             _ => Verdict::Fresh,
         }
@@ -188,8 +191,11 @@ mod tests {
             // A perfect generator, however few the episodes are.
             let fresh = judge(&training, &episodes("fresh", &centres, 2000 / count), count);
             assert!(fresh.verdict() == Verdict::Fresh && (fresh.probability - 0.5).abs() < 0.05, "{count}: {fresh:?}");
-            let far: Vec<f32> = training.iter().map(|x| 3.0 * x + 2.0).collect();
+            let mut far: Vec<f32> = training.iter().map(|x| 3.0 * x + 2.0).collect();
             assert_eq!(judge(&training, &far, count).verdict(), Verdict::Beside, "{count} episodes");
+            // Every fiftieth of them a training row: too few for p, and nothing that chance does.
+            far.chunks_exact_mut(4).zip(training.chunks_exact(4)).step_by(50).for_each(|(x, t)| x.copy_from_slice(t));
+            assert_eq!(judge(&training, &far, count).verdict(), Verdict::Copies, "{count} episodes");
         }
     }
 

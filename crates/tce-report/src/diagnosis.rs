@@ -5,7 +5,7 @@ use maud::{Markup, html};
 use tce_data::Task;
 use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::coverage::NEIGHBOUR;
-use tce_diagnosis::memorisation::BESIDE;
+use tce_diagnosis::memorisation::{BESIDE, IDENTICAL};
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread, Verdict,
 };
@@ -78,7 +78,7 @@ fn lede(d: &Diagnosis) -> String {
         let source = |c: Option<Coverage>| c.and_then(|c| c.source).map_or("–".into(), percent);
         text += &format!(
             "With y_max = {} generated rows cover {} of the target's and {} of the source's states ({} and {} at y_max = 0; as many \
-             target rows {} and {}).",
+             fresh target rows {} and {}).",
             plain(d.y_max),
             target(own.coverage),
             source(own.coverage),
@@ -193,9 +193,9 @@ fn coverage(d: &Diagnosis) -> Markup {
         false,
         vec![
             line("target states", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
-            line("the same by target rows", "f0", without(&|c| Some(c.target)).into_iter()),
+            line("the same by target rows of other episodes", "f0", without(&|c| Some(c.target)).into_iter()),
             line("source states", "m1", over(&|b| b.coverage.and_then(|c| c.source)).into_iter()),
-            line("the same by target rows", "f1", without(&|c| c.source).into_iter()),
+            line("the same by target rows of other episodes", "f1", without(&|c| c.source).into_iter()),
         ],
     )
 }
@@ -309,8 +309,8 @@ fn theorem(b: &Bounds) -> Markup {
     // How far each λ has to be from λ = 0 to be told from it.
     let doubted = |title: &str, style: &str, c: Option<&Curve>| {
         let point = |c: &Curve, k: usize| {
-            let (y, doubt) = (c.nearest[k], if k == 0 { 0.0 } else { c.doubt_between(0, k) });
-            Some(Point { x: GRID[k], y, band: Some((y - doubt, y + doubt)) })
+            let (y, doubt) = (c.nearest[k], if k == 0 { Some(0.0) } else { c.doubt_between(0, k) });
+            Some(Point { x: GRID[k], y, band: doubt.map(|d| (y - d, y + d)) })
         };
         c.and_then(|c| line(title, style, (0..GRID.len()).map(|k| point(c, k))))
     };
@@ -376,9 +376,12 @@ fn table(d: &Diagnosis) -> Markup {
         if let Some(c) = &b.value_alone {
             let whole = c.source(GRID.len() - 1);
             let all = [c.generated.mean_doubt(), c.source(1).mean_doubt(), whole.mean_doubt()].map(number).join(" / ");
-            rows.push(("Doubt of the latter: how far models that lack a third of the episodes are apart", all));
+            rows.push((
+                "Doubt of the latter: how far models that lack a third of the rows are apart, scaled by the next line",
+                all,
+            ));
         }
-        let text = "|ΔV| of target rows by models that lack them / how far the models are apart there";
+        let text = "|ΔV| of target rows by models that lack them / how far those are there from models that do not";
         rows.push((text, format!("{} / {}", number(b.held_out.0), number(b.held_out.1))));
     }
     if let Some(c) = &d.choice {
@@ -406,8 +409,9 @@ struct Mixed {
     seeds: usize,
 }
 
-/// The study's mixtures of generated and nearest source rows on `task`.
-fn mixtures(study: &Study, analysis: &Analysis, task: Task) -> Vec<Mixed> {
+/// The study's mixtures of generated and nearest source rows on `task` that differ from the diagnosed run in λ alone; where that run is
+/// not of the study, of its largest group.
+fn mixtures(study: &Study, analysis: &Analysis, task: Task, d: &Diagnosis) -> Vec<Mixed> {
     let of = |(m, method): (usize, &crate::study::Method)| -> Option<Mixed> {
         let row = analysis.tables.iter().flat_map(|t| &t.rows).find(|r| r.task == task)?;
         let cell = row.cells[m].as_ref()?;
@@ -428,14 +432,18 @@ fn mixtures(study: &Study, analysis: &Analysis, task: Task) -> Vec<Mixed> {
             seeds: cell.seeds,
         })
     };
-    alike(analysis.methods.iter().enumerate().filter_map(of).collect())
+    let own = study.runs.iter().find(|r| r.task == task && r.folder.directory.file_name().is_some_and(|n| *n == *d.of));
+    let own = own.and_then(|r| toml::from_str(&r.folder.config).ok()).map(without_mixture);
+    alike(analysis.methods.iter().enumerate().filter_map(of).collect(), own)
 }
 
-/// Those that differ in λ alone: the most of one kind, those of the first method among equals. The others say nothing of λ.
-fn alike(all: Vec<Mixed>) -> Vec<Mixed> {
+/// Those that differ in λ alone, from `own` if there is one: otherwise the most of one kind, those of the first method among equals. The
+/// others say nothing of λ.
+fn alike(all: Vec<Mixed>, own: Option<toml::Table>) -> Vec<Mixed> {
     let like = |rest: &toml::Table| all.iter().filter(|m| m.rest == *rest).count();
     // The first of the greatest: `max_by_key` takes the last.
-    let Some(rest) = all.iter().rev().max_by_key(|m| like(&m.rest)).map(|m| m.rest.clone()) else { return all };
+    let largest = || all.iter().rev().max_by_key(|m| like(&m.rest)).map(|m| m.rest.clone());
+    let Some(rest) = own.or_else(largest) else { return all };
     all.into_iter().filter(|m| m.rest == rest).collect()
 }
 
@@ -471,7 +479,7 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
                 } }
                 tbody {
                     @for (task, d, choice) in &rows {
-                        @let mixed = mixtures(study, analysis, *task);
+                        @let mixed = mixtures(study, analysis, *task, d);
                         @let several = mixed.iter().any(|m| m.lambda != mixed[0].lambda);
                         @let best = mixed.iter().max_by(|a, b| a.score.total_cmp(&b.score)).filter(|_| several);
                         tr {
@@ -500,8 +508,8 @@ fn explanation() -> Markup {
             p {
                 b { "Coverage. " } "A state of either domain is covered if a generated state lies within the distance of its "
                 (NEIGHBOUR) "th nearest neighbour among the states of its own domain (Naeem et al. 2020); the paper does not define its \
-                 curve. All sets have the same number of rows, so that rows of the very same distribution cover 97 %; covering target rows \
-                 are others than those that are covered."
+                 curve. All sets have the same number of rows, so that rows of the very same distribution cover 97 %. What is covered of the \
+                 target is one half of its episodes, and the covering target rows are of the other half; the generator saw both."
             }
             p {
                 b { "Reliability. " } "Lines are medians, bands reach from the 10th to the 90th percentile. Abundant rows are what the \
@@ -512,14 +520,15 @@ fn explanation() -> Markup {
                 b { "Copies. " } "The rows of every episode, and as large a share of the generated rows, are measured by their nearest training row of \
                  the other episodes (after Meehan et al. 2020). P is the probability that the generated row is the nearer one: one half for \
                  fresh rows. Rows are called copies from half the way between that and what copies get, and beside the data below "
-                (BESIDE) ". Where every episode is a place of its own, fresh rows get the P of copies."
+                (BESIDE) ". Where " (percent(IDENTICAL)) " of them are exact copies they are called so whatever P is. Where every episode is a place of its own, fresh rows get the P of copies."
             }
             p {
                 b { "Theorem 1. " } "Expectations over ρ" sub { "mix" } " are means over rows. V is that of implicit Q-learning on target and generated \
                  rows. By the data alone, the target's dynamics are models of the target rows: for values three that lack a third of the \
-                 episodes each, V at the step that they predict, and for total variation one of all rows. Otherwise they are the simulator, and \
+                 rows each, whole episodes where they are even enough, V at the step that they predict, and for total variation one of all rows. Otherwise they are the simulator, and \
                  for total variation a model of abundant rows. The band is the doubt: the rule tells a λ from 0 where \
-                 the bound at 0 lies outside of it. In a \
+                 the bound at 0 lies outside of it. It holds the errors of finite samples, in which every trajectory counts once, for nine \
+                 comparisons at once, and for values how far the three models are apart; for total variation, samples alone. In a \
                  deterministic world the total variation of sharp models is near 1 wherever they differ at all: the bound on values is the one \
                  that tells rows apart."
             }
@@ -540,7 +549,8 @@ mod tests {
             score: 0.0,
             seeds: 1,
         };
-        let titles = |all| alike(all).into_iter().map(|m| m.title).collect::<Vec<_>>();
+        let titled = |all, own| alike(all, own).into_iter().map(|m| m.title).collect::<Vec<_>>();
+        let titles = |all| titled(all, None);
         let og =
             || mixed("og", "generator.y_max = 0.2\nmixture = { generated = 'tce', source = 'none', lambda = 0.0 }");
         let nn =
@@ -556,5 +566,7 @@ mod tests {
         assert_eq!(titles(vec![wide(), og(), weighed(), nn()]), ["og", "nn"]);
         assert_eq!(titles(vec![wide(), og()]), ["wide"], "nothing to compare");
         assert!(titles(vec![]).is_empty());
+        // The diagnosed run's own kind, however many there are of others.
+        assert_eq!(titled(vec![wide(), og(), nn()], Some(wide().rest)), ["wide"]);
     }
 }

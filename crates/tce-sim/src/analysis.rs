@@ -19,6 +19,13 @@ pub struct Simulated {
     pub terminals: Vec<bool>,
 }
 
+impl Simulated {
+    /// Whether the physics held in row `i`.
+    pub fn held(&self, i: usize) -> bool {
+        self.rewards[i].is_finite()
+    }
+}
+
 /// Rows that one environment simulates before the work is split further.
 const CHUNK: usize = 64;
 

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use rand::seq::SliceRandom;
 use tce_base::Streams;
 use tce_base::random::choose;
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
@@ -43,18 +44,22 @@ pub struct Work<'a> {
 pub struct Sources {
     /// Those that are measured, the nearest to the target first.
     pub sorted: Transitions,
+    /// The episode that each of them is of.
+    episodes: Vec<usize>,
     /// Some of the nearest share.
     nearest: Transitions,
     /// None of those that are measured: what models may learn from.
     pub others: Transitions,
 }
 
-/// Equally many states of each domain that coverage is counted over, and of target rows that are none of them.
+/// Equally many states of each domain that coverage is counted over, and target rows that are none of them.
 struct References {
     rows: usize,
     target: coverage::Reference,
     source: Option<coverage::Reference>,
     other_target: Transitions,
+    /// Whether the other target rows are of other episodes.
+    by_episode: bool,
 }
 
 impl References {
@@ -112,8 +117,14 @@ impl Work<'_> {
             ));
         }
         let references = self.references(&streams, sources.as_ref(), own.kept())?;
-        if references.is_none() {
-            notes.push("There are too few rows for a coverage.".into());
+        match &references {
+            None => notes.push("There are too few rows for a coverage.".into()),
+            Some(r) if !r.by_episode => notes.push(
+                "The target's episodes cannot be split into halves: its coverage by other target rows is by rows of the same episodes, \
+                 and more than fresh rows would cover."
+                    .into(),
+            ),
+            Some(_) => (),
         }
         let covered =
             |rows: &Transitions| references.as_ref().map_or(Ok(None), |r| r.covered_by(rows, self.units(), &streams));
@@ -189,29 +200,34 @@ impl Work<'_> {
             if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
         let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
         let measured = pick(&order, "sources");
+        let of_rows: Vec<usize> =
+            all.episodes().iter().enumerate().flat_map(|(k, e)| vec![k; e.end - e.start]).collect();
         Ok(Some(Sources {
             sorted: all.select(&measured),
+            episodes: measured.iter().map(|&i| of_rows[i]).collect(),
             nearest: all.select(&pick(&order[..near], "nearest")),
-            others: without(all, &measured),
+            others: all.select(&others(all.len(), &measured)),
         }))
     }
 
     /// As many rows as there are of each kind, `kept` of them generated; None where that is too few for neighbourhoods.
     fn references(&self, streams: &Streams, sources: Option<&Sources>, kept: usize) -> Result<Option<References>> {
         let target = &self.subject.inputs.target.rows;
-        let rows = REFERENCE.min(target.len() / 2).min(kept).min(sources.map_or(usize::MAX, |s| s.sorted.len()));
+        let (first, second, by_episode) = halves(target, streams);
+        let enough = first.len().min(second.len()).min(kept).min(sources.map_or(usize::MAX, |s| s.sorted.len()));
+        let rows = REFERENCE.min(enough);
         if rows <= coverage::NEIGHBOUR {
             return Ok(None);
         }
         let reference =
             |t: &Transitions| coverage::Reference::new(self.units().states(&t.observations), self.units().live.len());
-        let chosen = choose(&mut streams.stream("reference/target"), target.len(), rows);
         let source = sources.map(|s| reference(&few(&s.sorted, rows, streams, "reference/source"))).transpose()?;
         Ok(Some(References {
             rows,
-            target: reference(&target.select(&chosen))?,
+            target: reference(&few(&target.select(&first), rows, streams, "reference/target"))?,
             source,
-            other_target: without(target, &chosen),
+            other_target: target.select(&second),
+            by_episode,
         }))
     }
 
@@ -291,10 +307,10 @@ impl Work<'_> {
             let found = self.sampler.label(&rows.observations, &rows.next_observations)?;
             Ok(Some((rmse(&found.actions, &rows.actions), rmse(&found.rewards, &rows.rewards))))
         };
-        let terminal = own.simulated.as_ref().map(|s| {
-            let kept = own.keep.iter().zip(own.rows.terminals.iter().zip(&s.terminals)).filter(|(k, _)| **k);
-            let wrong = kept.filter(|(_, (found, truth))| found != truth).count();
-            wrong as f64 / own.kept().max(1) as f64
+        let terminal = own.simulated.as_ref().and_then(|s| {
+            let known: Vec<usize> = (0..own.len()).filter(|&i| own.keep[i] && s.held(i)).collect();
+            let wrong = known.iter().filter(|&&i| own.rows.terminals[i] != s.terminals[i]).count();
+            (!known.is_empty()).then(|| wrong as f64 / known.len() as f64)
         });
         Ok(Labels {
             held_out_action: held_out.map(|e| (e.action_rmse, e.action_std)),
@@ -317,7 +333,8 @@ impl Work<'_> {
                 gaussian::total_variation(p, q, streams)
             };
             let rated = |densities: &[Densities], own: usize| Rated::certain(against(densities, own));
-            Curve::of(&rated(&of_sources, models.source?), &rated(&of_generated, models.generated))
+            let of_sources = rated(&of_sources, models.source?).grouped(&sources.episodes);
+            Curve::of(&of_sources, &rated(&of_generated, models.generated))
         };
         let transition = models.abundant.and_then(tv);
         let value = match self.simulator {
@@ -325,9 +342,9 @@ impl Work<'_> {
             Some((agent, shift)) => {
                 let gap = |t: &Transitions| -> Result<Rated> {
                     let truth = tce_sim::simulate(agent, shift, &t.observations, &t.actions)?;
-                    Ok(Rated::certain(models.value_gap(t, &truth.next_observations, &truth.terminals)))
+                    Ok(Rated::certain(models.value_gap(t, &truth)))
                 };
-                Curve::of(&gap(&sources.sorted)?, &gap(&generated)?)
+                Curve::of(&gap(&sources.sorted)?.grouped(&sources.episodes), &gap(&generated)?)
             }
         };
         let held_out = models.held_out(&inputs.target.rows, inputs.agent);
@@ -342,7 +359,10 @@ impl Work<'_> {
             transition,
             value,
             transition_alone: tv(models.limited),
-            value_alone: Curve::of(&alone(&sources.sorted, &of_sources), &alone(&generated, &of_generated)),
+            value_alone: Curve::of(
+                &alone(&sources.sorted, &of_sources).grouped(&sources.episodes),
+                &alone(&generated, &of_generated),
+            ),
             held_out,
         })
     }
@@ -364,6 +384,7 @@ fn blown_up(bounds: &[AtBound], own: f64, theorem: Option<&Bounds>) -> Vec<Strin
 }
 
 /// One number per row of a batch, for every figure that can be measured.
+#[derive(Default)]
 struct Figures {
     distance: Vec<f64>,
     transition_kl: Option<Vec<f64>>,
@@ -376,6 +397,9 @@ impl Figures {
     /// `step` is the spread of the target's steps in the dimensions `live`.
     fn of(batch: &Batch, distances: &[f32], models: &Models, step: &[f32], live: &[usize]) -> Result<Self> {
         let t = &batch.rows;
+        if t.is_empty() {
+            return Ok(Self::default());
+        }
         let kl = |abundant: usize| {
             let densities = models.densities(&t.observations, &t.actions);
             let (p, q) = (models.normals(&densities[models.limited]), models.normals(&densities[abundant]));
@@ -415,11 +439,33 @@ pub fn few(t: &Transitions, count: usize, streams: &Streams, name: &str) -> Tran
     t.select(&choose(&mut streams.stream(name), t.len(), count))
 }
 
-/// The rows that are not at `places`, in their order.
-fn without(t: &Transitions, places: &[usize]) -> Transitions {
-    let mut free = vec![true; t.len()];
+/// Two halves of the rows in whole episodes, drawn at random, and whether that could be: where one would have less than a third of the rows,
+/// rows are drawn instead.
+fn halves(t: &Transitions, streams: &Streams) -> (Vec<usize>, Vec<usize>, bool) {
+    let mut episodes = t.episodes();
+    episodes.shuffle(&mut streams.stream("halves"));
+    // The longest first: each goes where there are fewer rows.
+    episodes.sort_by_key(|e| std::cmp::Reverse(e.end - e.start));
+    let (mut first, mut second) = (Vec::new(), Vec::new());
+    for e in episodes {
+        let half = if second.len() < first.len() { &mut second } else { &mut first };
+        half.extend(e.start..e.end);
+    }
+    if 3 * second.len().min(first.len()) < t.len() {
+        let chosen = choose(&mut streams.stream("halves/rows"), t.len(), t.len() / 2);
+        let second = others(t.len(), &chosen);
+        return (chosen, second, false);
+    }
+    first.sort_unstable();
+    second.sort_unstable();
+    (first, second, true)
+}
+
+/// Which of 0 .. `count` are not among `places`.
+fn others(count: usize, places: &[usize]) -> Vec<usize> {
+    let mut free = vec![true; count];
     places.iter().for_each(|&i| free[i] = false);
-    t.select(&(0..t.len()).filter(|&i| free[i]).collect::<Vec<_>>())
+    (0..count).filter(|&i| free[i]).collect()
 }
 
 /// (s, s') of live dimensions in units of the states, `[N, 2 d]`.

@@ -36,7 +36,7 @@ use measures::Work;
 use rows::Sampler;
 
 /// Changes when the same rows would give other figures.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
 
@@ -100,6 +100,15 @@ pub fn can_be_diagnosed(of: &str, config: &Config) -> Result<()> {
     }
 }
 
+/// The place of `seed` among a run's seeds.
+///
+/// # Errors
+/// If it is none of them.
+pub fn member_of(seeds: &[u64], seed: u64) -> Result<usize> {
+    let place = seeds.iter().position(|s| *s == seed);
+    place.ok_or_else(|| Error::Usage(format!("--seed {seed}: the run's seeds are {seeds:?}; choose one of them")))
+}
+
 /// Diagnoses, or takes the result from its stage under `root`. Returns it with the stage's directory.
 ///
 /// # Errors
@@ -118,10 +127,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     }
     let Subject { inputs, config, seeds, seed, .. } = *subject;
     can_be_diagnosed(&subject.of, config)?;
-    let member = seeds
-        .iter()
-        .position(|s| *s == seed)
-        .ok_or_else(|| Error::Usage(format!("--seed {seed}: the run's seeds are {seeds:?}; choose one of them")))?;
+    let member = member_of(seeds, seed)?;
     let source = inputs.source.as_ref().map(|s| ("source", s));
     for (name, table) in [("target", &inputs.target)].into_iter().chain(source) {
         let found = table.rows.len();

@@ -10,7 +10,8 @@
 //! | value | V of IQL on target and generated rows |
 //!
 //! The limited model is what a user has. The generator saw the rows that it saw, so that both may err alike; the three that lack a third
-//! say where what they agree on is no more than what each of them was told, and on the rows that they lack how wrong they are.
+//! say where what they agree on is no more than what each of them was told, and on the rows that they lack how wrong they are. V is that
+//! of implicit Q-learning with standardised states, whatever the run's own learner does.
 
 use std::sync::Arc;
 
@@ -23,7 +24,7 @@ use tce_learn::{
     TransitionModel, map_rows, train, train_labels, train_transition_models,
 };
 use tce_nn::Device;
-use tce_sim::{simulate, terminal_rule};
+use tce_sim::{Simulated, simulate, terminal_rule};
 
 use super::measures::{Sources, Work, few};
 use super::rows::Batch;
@@ -60,6 +61,7 @@ pub struct Models {
 /// What the target's dynamics do at the states and actions of `t`; rows in which the physics blows up are left out.
 fn under_target((agent, shift): (Agent, tce_data::Shift), t: &Transitions) -> Result<Transitions> {
     let truth = simulate(agent, shift, &t.observations, &t.actions)?;
+    let held: Vec<usize> = (0..t.len()).filter(|&i| truth.held(i)).collect();
     let all = Transitions {
         next_observations: truth.next_observations,
         rewards: truth.rewards,
@@ -67,7 +69,7 @@ fn under_target((agent, shift): (Agent, tce_data::Shift), t: &Transitions) -> Re
         terminals: truth.terminals,
         ..t.clone()
     };
-    Ok(all.select(&(0..all.len()).filter(|&i| all.rewards[i].is_finite()).collect::<Vec<_>>()))
+    Ok(all.select(&held))
 }
 
 impl Models {
@@ -206,10 +208,10 @@ impl Models {
         values.iter().zip(terminals).map(|(v, t)| if *t { 0.0 } else { f64::from(*v) }).collect()
     }
 
-    /// |V(s') − V(truth)| of every row of `t`.
-    pub fn value_gap(&self, t: &Transitions, truth: &[f32], terminals: &[bool]) -> Vec<f64> {
-        let (own, other) = (self.values(&t.next_observations, &t.terminals), self.values(truth, terminals));
-        own.iter().zip(other).map(|(a, b)| (a - b).abs()).collect()
+    /// |V(s') − V(truth)| of every row of `t`; NaN where the physics blew up.
+    pub fn value_gap(&self, t: &Transitions, truth: &Simulated) -> Vec<f64> {
+        let own = self.values(&t.next_observations, &t.terminals);
+        gaps(&own, &self.values(&truth.next_observations, &truth.terminals), truth)
     }
 
     /// V at the successors that each of the thirds predicts, per model. `densities` are those of `t`.
@@ -227,23 +229,34 @@ impl Models {
         let own = self.values(&t.next_observations, &t.terminals);
         let predicted = self.predicted_values(t, densities, agent);
         let gap = |i: usize| predicted.iter().map(|v| (own[i] - v[i]).abs()).sum::<f64>() / predicted.len() as f64;
-        Rated {
-            gap: (0..t.len()).map(gap).collect(),
-            doubt: (0..t.len()).map(|i| disagreement(&predicted, i)).collect(),
-        }
+        let doubt = (0..t.len()).map(|i| disagreement(&predicted, i)).collect();
+        Rated { doubt, ..Rated::certain((0..t.len()).map(gap).collect()) }
     }
 
-    /// Mean gap of target rows by the model that lacks them, and mean doubt of all three: how much of a model's error their
+    /// Mean gap of target rows by the model that lacks them, and how far that is from the other two: how much of a model's error their
     /// disagreement shows.
     pub fn held_out(&self, target: &Transitions, agent: Option<Agent>) -> (f64, f64) {
         let own = self.values(&target.next_observations, &target.terminals);
         let densities = self.densities(&target.observations, &target.actions);
-        let predicted = self.predicted_values(target, &densities, agent);
-        let third_of = thirds(target);
-        let n = target.len() as f64;
-        let gap = (0..target.len()).map(|i| (own[i] - predicted[third_of[i]][i]).abs()).sum::<f64>() / n;
-        (gap, (0..target.len()).map(|i| disagreement(&predicted, i)).sum::<f64>() / n)
+        held_out_rates(&own, &self.predicted_values(target, &densities, agent), &thirds(target))
     }
+}
+
+/// |own − other| where the physics held; NaN elsewhere, and not the |own| that an episode which is over would leave.
+fn gaps(own: &[f64], other: &[f64], truth: &Simulated) -> Vec<f64> {
+    let gap = |(i, (a, b)): (usize, (&f64, &f64))| if truth.held(i) { (a - b).abs() } else { f64::NAN };
+    own.iter().zip(other).enumerate().map(gap).collect()
+}
+
+/// [`Models::held_out`] from numbers. The two models that have seen a row agree on it, as no two models do elsewhere: only their distances
+/// from the one that has not seen it count.
+fn held_out_rates(own: &[f64], predicted: &[Vec<f64>], lacks: &[usize]) -> (f64, f64) {
+    let n = own.len() as f64;
+    let without = |i: usize| predicted[lacks[i]][i];
+    let gap = (0..own.len()).map(|i| (own[i] - without(i)).abs()).sum::<f64>() / n;
+    let apart =
+        |i: usize| predicted.iter().map(|v| (v[i] - without(i)).abs()).sum::<f64>() / (predicted.len() - 1) as f64;
+    (gap, (0..own.len()).map(apart).sum::<f64>() / n)
 }
 
 /// Mean |difference| over the pairs of models in row `i`.
@@ -262,13 +275,15 @@ fn successor_terminals(agent: Option<Agent>, t: &Transitions, next: &[f32]) -> V
     }
 }
 
-/// The third that each row belongs to: whole episodes, whose rows are alike, and equal parts of the log where it has fewer than three.
+/// The third that each row belongs to: whole episodes, whose rows are alike; equal parts of the log where it has fewer than three, or
+/// where whole episodes would leave a model less than half of the rows.
 fn thirds(t: &Transitions) -> Vec<usize> {
     let n = t.len();
     let by_place = |i: usize| i * THIRDS / n;
+    let equal = || (0..n).map(by_place).collect::<Vec<_>>();
     let episodes = t.episodes();
     if episodes.len() < THIRDS {
-        return (0..n).map(by_place).collect();
+        return equal();
     }
     // By the middle of each, so that the parts are as equal as whole episodes allow; every part gets one at least.
     let last = episodes.len() - 1;
@@ -282,7 +297,9 @@ fn thirds(t: &Transitions) -> Vec<usize> {
         let place = parts.iter().rposition(|p| *p == 0).filter(|p| *p > 0).unwrap_or(1);
         parts[place] = 1;
     }
-    episodes.iter().zip(parts).flat_map(|(e, part)| vec![part; e.end - e.start]).collect()
+    let whole: Vec<usize> = episodes.iter().zip(parts).flat_map(|(e, part)| vec![part; e.end - e.start]).collect();
+    let most = (0..THIRDS).map(|k| whole.iter().filter(|p| **p == k).count()).max().expect("parts");
+    if 2 * most > n { equal() } else { whole }
 }
 
 #[cfg(test)]
@@ -301,9 +318,40 @@ mod tests {
     fn thirds_are_whole_episodes_and_none_is_empty() {
         assert_eq!(thirds(&log(&[2, 2, 2])), [0, 0, 1, 1, 2, 2]);
         assert_eq!(thirds(&log(&[1; 6])), [0, 0, 1, 1, 2, 2]);
-        assert_eq!(thirds(&log(&[9, 1, 1])), [[0; 9].as_slice(), &[1, 2]].concat());
-        assert_eq!(thirds(&log(&[1, 1, 9])), [[0, 1].as_slice(), &[2; 9]].concat());
+        assert_eq!(thirds(&log(&[4, 1, 4])), [[0; 4].as_slice(), &[1], &[2; 4]].concat());
         assert_eq!(thirds(&log(&[4, 2])), [0, 0, 1, 1, 2, 2], "too few episodes");
+    }
+
+    /// A model of the few rows that are not in the one long episode would be no model.
+    #[test]
+    fn no_model_lacks_more_than_half_of_the_rows() {
+        for lengths in [[998, 1, 1], [1, 1, 998], [1, 998, 1], [200, 600, 200]] {
+            let found = thirds(&log(&lengths));
+            let counts = [0, 1, 2].map(|k| found.iter().filter(|p| **p == k).count());
+            assert!(counts.iter().all(|c| (333..=334).contains(c)), "{lengths:?}: {counts:?}");
+        }
+    }
+
+    /// The model of the first row lacks it and is off by 2; the others, which have seen it, are off by 0 and 1, that is 2 and 1 from the first.
+    #[test]
+    fn held_out_rows_are_rated_by_the_models_that_lack_them() {
+        let predicted = [vec![7.0, 3.0], vec![5.0, 3.0], vec![6.0, 3.0]];
+        let (gap, apart) = held_out_rates(&[5.0, 4.0], &predicted, &[0, 2]);
+        assert!((gap - (2.0 + 1.0) / 2.0).abs() < 1e-12 && (apart - (1.5 + 0.0) / 2.0).abs() < 1e-12, "{gap} {apart}");
+    }
+
+    #[test]
+    fn rows_in_which_the_physics_blew_up_have_no_gap() {
+        let truth = Simulated {
+            next_observations: vec![0.0, f32::NAN],
+            rewards: vec![1.0, f32::NAN],
+            terminals: vec![true, true],
+        };
+        let found = gaps(&[3.0, 3.0], &[0.0, 0.0], &truth);
+        assert!(
+            found[0] == 3.0 && found[1].is_nan(),
+            "an end by the rule is one, a fault of the physics is none: {found:?}"
+        );
     }
 
     #[test]

@@ -59,8 +59,13 @@ impl Batch {
 
     /// Refuses a sample of which the filter leaves nothing: there is nothing to measure, nor to learn from.
     pub fn ensure_kept(&self, filter: &FilterConfig) -> Result<()> {
-        match self.kept() {
-            0 => Err(everything_rejected(self.len() + self.lost, filter)),
+        match (self.len(), self.kept()) {
+            (0, _) => Err(Error::Failed(format!(
+                "none of {} generated rows is made of finite numbers: the score networks have diverged; train them again, with \
+                 another seed or a smaller generator.learning_rate",
+                self.lost
+            ))),
+            (_, 0) => Err(everything_rejected(self.len() + self.lost, filter)),
             _ => Ok(()),
         }
     }
@@ -74,7 +79,8 @@ impl Sampler<'_> {
         Ok(self.finisher.label(&pairs)?.swap_remove(self.member).transitions)
     }
 
-    /// `rows` rows under ŷ ~ U(0, y_max). Batches of one `purpose` are drawn from the same noise: they differ by their bound alone.
+    /// `rows` rows under ŷ ~ U(0, y_max), none where no number is finite. Batches of one `purpose` are drawn from the same noise: they
+    /// differ by their bound alone.
     pub fn sample(&self, rows: usize, y_max: f32, purpose: &str) -> Result<Batch> {
         let members: Vec<Streams> =
             self.seeds.iter().map(|&s| Streams::new(s).child(&format!("diagnosis/{purpose}"))).collect();
@@ -96,9 +102,9 @@ impl Sampler<'_> {
         }
         let lost = rows - kept_labels.len();
         if kept_labels.is_empty() {
-            return Err(Error::Failed(format!(
-                "none of the {rows} rows generated with y_max = {y_max} is made of finite numbers: the score networks have diverged"
-            )));
+            let rows = Transitions::new(target.obs_dim, target.act_dim);
+            let simulated = self.simulator.map(|_| Simulated::default());
+            return Ok(Batch { rows, keep: vec![], labels: vec![], simulated, lost });
         }
         let keep = self.finisher.keep(&s, &s2);
         let rows = self.label(&units.put_back(&s), &units.put_back(&s2))?;
@@ -107,5 +113,25 @@ impl Sampler<'_> {
             None => None,
         };
         Ok(Batch { rows, keep, labels: kept_labels, simulated, lost })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_without_numbers_and_one_without_survivors_are_told_apart() {
+        let batch = |keep: Vec<bool>, lost: usize| Batch {
+            rows: Transitions::new(1, 1),
+            labels: vec![0.0; keep.len()],
+            keep,
+            simulated: None,
+            lost,
+        };
+        let told = |b: Batch| b.ensure_kept(&FilterConfig::default()).map_err(|e| e.to_string());
+        assert!(told(batch(vec![], 5)).unwrap_err().contains("none of 5 generated rows is made of finite numbers"));
+        assert!(told(batch(vec![false; 3], 1)).unwrap_err().contains("the filter rejected all 4 generated rows"));
+        assert_eq!(told(batch(vec![false, true], 1)), Ok(()));
     }
 }

@@ -11,7 +11,7 @@ use tce_learn::TransitionConfig;
 use tce_nn::cpu;
 
 use crate::config::Config;
-use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose};
+use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
 use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, Inputs};
 use crate::layers::ConfigArgs;
@@ -204,6 +204,8 @@ impl RunArgs {
                     ));
                 }
                 can_be_diagnosed(&directory.display().to_string(), &run.config)?;
+                let seed = self.seed.unwrap_or(run.seeds[0]);
+                member_of(&run.seeds, seed)?;
                 let root = self.out.unwrap_or_else(|| run.root.clone());
                 let data = DataArgs {
                     source: self.source,
@@ -220,7 +222,7 @@ impl RunArgs {
                     inputs: &inputs,
                     config: &run.config,
                     seeds: &run.seeds,
-                    seed: self.seed.unwrap_or(run.seeds[0]),
+                    seed,
                 };
                 diagnose(&subject, &options, &root, &device)?
             }
