@@ -87,7 +87,9 @@ fn a_run_is_measured_and_its_report_shows_it() {
         "--transition-steps 0: expected at least 1",
     );
     refused(&diagnose("out/nothing", &[]), 1, "spec.json: no such file; give the directory of a finished run");
-    refused(&diagnose(&og, &["--seed", "7"]), 2, "the run's seeds are [0]");
+    // Before its data are looked for.
+    let absent = ["diagnose", &og, "--seed", "7", "--source", "absent.hdf5", "--target", "absent.hdf5"];
+    refused(&absent.map(str::to_owned), 2, "the run's seeds are [0]");
     refused(&diagnose(&og, &["--set", "learner.steps=1"]), 2, "a run has its configuration");
     let other = ["diagnose", &og, "--source", target.to_str().unwrap(), "--target", source.to_str().unwrap()];
     refused(&other.map(str::to_owned), 2, "name the run's own file with --target");

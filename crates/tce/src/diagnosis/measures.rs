@@ -483,3 +483,38 @@ fn decimal(y: f32) -> f64 {
 fn rmse(a: &[f32], b: &[f32]) -> f64 {
     (a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / a.len().max(1) as f64).sqrt()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn halves_of(lengths: &[usize]) -> (Vec<usize>, Vec<usize>, bool, Transitions) {
+        let mut t = Transitions::new(1, 1);
+        for &length in lengths {
+            (0..length).for_each(|i| t.push(&[0.0], &[0.0], 0.0, &[0.0], false, i + 1 == length));
+        }
+        let (first, second, by_episode) = halves(&t, &Streams::new(1));
+        (first, second, by_episode, t)
+    }
+
+    #[test]
+    fn halves_are_whole_episodes_where_they_are_even_enough() {
+        for (lengths, whole) in [
+            (vec![10; 5], true),
+            (vec![10, 10], true),
+            (vec![30, 10, 10, 10], true),
+            (vec![50], false),
+            (vec![50, 5], false),
+            (vec![997, 1, 1, 1], false),
+        ] {
+            let (first, second, by_episode, t) = halves_of(&lengths);
+            assert_eq!(by_episode, whole, "{lengths:?}");
+            let mut all = [first.clone(), second.clone()].concat();
+            all.sort_unstable();
+            assert_eq!(all, (0..t.len()).collect::<Vec<_>>(), "{lengths:?}: every row once");
+            assert!(3 * first.len().min(second.len()) >= t.len(), "{lengths:?}: {} and {}", first.len(), second.len());
+            let split = |e: &tce_data::Episode| first.contains(&e.start) != first.contains(&(e.end - 1));
+            assert!(!whole || !t.episodes().iter().any(split), "{lengths:?}");
+        }
+    }
+}
