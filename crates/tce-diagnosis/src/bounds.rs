@@ -25,6 +25,7 @@
 //! is 0, and not every other λ is told to be worse, the data do not say, and 0 stands as the paper's default.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -243,6 +244,15 @@ pub struct Choice {
     pub generated_alone: f64,
 }
 
+impl fmt::Display for Choice {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self.told {
+            true => write!(f, "{}", self.lambda),
+            false => write!(f, "cannot tell ({} by default)", self.lambda),
+        }
+    }
+}
+
 impl Choice {
     /// The rule.
     pub fn of(curve: &Curve) -> Self {
@@ -327,7 +337,7 @@ mod tests {
         let noisy: Vec<f64> = (0..100).map(|i| if i % 2 == 0 { 0.0 } else { 0.8 }).collect();
         let choice = Choice::of(&curve(&[0.395; 100], &noisy));
         assert_eq!((choice.lambda, choice.told), (0.0, false));
-        assert!(choice.least > 0.0);
+        assert!(choice.least > 0.0 && choice.to_string() == "cannot tell (0 by default)");
     }
 
     /// Models that guess at the source's rows do not decide between them and generated ones.

@@ -17,6 +17,7 @@
 //! The measure needs episodes that visit the same states, as the gait of one policy does. Where every episode is a place of its own,
 //! fresh rows get the p of copies, and only exact copies are told from them, by [`Memorisation::identical`].
 
+use std::fmt;
 use std::ops::Range;
 
 use rand::seq::SliceRandom;
@@ -56,6 +57,18 @@ pub enum Verdict {
     Fresh,
     /// Farther from the training rows than held-out rows are.
     Beside,
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            Verdict::Copies => "generated rows look like copies of training rows",
+            Verdict::Fresh => "generated rows are no copies of training rows",
+            Verdict::Beside => {
+                "generated rows are no copies, but lie farther from the training rows than held-out rows do"
+            }
+        })
+    }
 }
 
 impl Memorisation {

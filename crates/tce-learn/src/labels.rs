@@ -267,7 +267,8 @@ fn pairs(s: &[f32], s2: &[f32], dim: usize) -> Vec<f32> {
     Rows::join(&[(s, dim), (s2, dim)]).to_vec()
 }
 
-fn rmse(predicted: &[f32], actual: &[f32]) -> f64 {
+/// Root mean square of the differences of two tables of the same shape; NaN if they are empty.
+pub fn rmse(predicted: &[f32], actual: &[f32]) -> f64 {
     let sum: f64 = predicted.iter().zip(actual).map(|(p, a)| (*p as f64 - *a as f64).powi(2)).sum();
     (sum / actual.len() as f64).sqrt()
 }

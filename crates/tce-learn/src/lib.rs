@@ -64,7 +64,7 @@ pub use dmc::{Dmc, DmcConfig};
 pub use error::LearnError;
 pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
-pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, train_labels};
+pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, rmse, train_labels};
 pub use meta_dt::{MetaDt, MetaDtConfig};
 pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;

@@ -8,7 +8,7 @@
 //! third of an IQL update (`bench/speed.md`), and weights that many batches share can be packed once here.
 //!
 //! Every element is one sum over k in ascending order, one fused multiply-add a term (sixteen interleaved sums where b has
-//! few columns): the bits depend neither on the width of the vectors nor on how work is cut.
+//! few columns and was not packed before): the bits depend neither on the width of the vectors nor on how work is cut.
 
 use std::cell::RefCell;
 use std::mem::MaybeUninit;
@@ -176,8 +176,11 @@ pub(crate) struct Packed {
 impl Packed {
     /// Packs b `[k, n]`.
     pub fn new(b: Matrix, k: usize, n: usize) -> Self {
+        Self::on(Isa::best(), b, k, n)
+    }
+
+    fn on(isa: Isa, b: Matrix, k: usize, n: usize) -> Self {
         assert!(b.holds(k, n));
-        let isa = Isa::best();
         let mut data = vec![0.0; n.div_ceil(isa.panel(n)) * (isa.panel(n) * k + 16 * k.div_ceil(TERMS))];
         let job = Job { m: 1, n, k, a: b.view(), b: b.view(), packed: std::ptr::null(), out: std::ptr::null_mut() };
         // SAFETY: the matrix holds what is read, and `data` has room for all panels.

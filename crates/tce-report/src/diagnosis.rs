@@ -7,7 +7,7 @@ use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::coverage::NEIGHBOUR;
 use tce_diagnosis::memorisation::{BESIDE, IDENTICAL};
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread, Verdict,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread,
 };
 
 use crate::analysis::Analysis;
@@ -95,7 +95,8 @@ fn lede(d: &Diagnosis) -> String {
         }
     }
     if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
-        text += &format!(" {}.", verdict(m.verdict()));
+        let verdict = m.verdict().to_string();
+        text += &format!(" {}.", verdict.replacen("generated", "Generated", 1));
     }
     if let Some(c) = &d.choice {
         text += &match c {
@@ -108,19 +109,6 @@ fn lede(d: &Diagnosis) -> String {
         };
     }
     text
-}
-
-fn verdict(v: Verdict) -> &'static str {
-    match v {
-        Verdict::Copies => "They look like copies of training rows",
-        Verdict::Fresh => "They are no copies of training rows",
-        Verdict::Beside => "They are no copies, but lie farther from the training rows than held-out rows do",
-    }
-}
-
-/// A choice of the rule in a cell.
-fn chosen(c: &Choice) -> String {
-    if c.told { plain(c.lambda) } else { format!("cannot tell ({} by default)", plain(c.lambda)) }
 }
 
 fn class(title: &str, class: &str) -> Series {
@@ -385,10 +373,10 @@ fn table(d: &Diagnosis) -> Markup {
         rows.push((text, format!("{} / {}", number(b.held_out.0), number(b.held_out.1))));
     }
     if let Some(c) = &d.choice {
-        rows.push(("λ of the rule, from the data alone", chosen(c)));
+        rows.push(("λ of the rule, from the data alone", c.to_string()));
     }
     if let Some(c) = &d.choice_by_simulator {
-        rows.push(("λ of the rule where the simulator measures", chosen(c)));
+        rows.push(("λ of the rule where the simulator measures", c.to_string()));
     }
     html! {
         div class="scroll" {
@@ -485,9 +473,9 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
                         tr {
                             th scope="row" { (short(task)) }
                             td class="text" { (d.of) ", seed " (d.seed) }
-                            td class="text" { (chosen(choice)) }
+                            td class="text" { (choice.to_string()) }
                             td { (plain(choice.least)) }
-                            td class="text" { (d.choice_by_simulator.as_ref().map_or("–".into(), chosen)) }
+                            td class="text" { (d.choice_by_simulator.as_ref().map_or("–".into(), Choice::to_string)) }
                             td class="edge text" {
                                 @for m in &mixed {
                                     div { (m.title) ", λ = " (plain(m.lambda)) ": " (minus(format!("{:.1}", m.score))) " (" (counted(m.seeds, "seed", "seeds")) ")" }

@@ -60,8 +60,8 @@ proptest! {
             let mut out = room(m * n);
             before.iter().zip(&mut out).for_each(|(b, o)| { o.write(*b); });
             let whole;
-            let right = match packed && isa == Isa::best() {
-                true => { whole = Packed::new(right, k, n); Right::Packed(&whole) }
+            let right = match packed {
+                true => { whole = Packed::on(isa, right, k, n); Right::Packed(&whole) }
                 false => Right::Matrix(right),
             };
             product_on(isa, &mut out, left, right, [m, k, n], finish);

@@ -11,7 +11,7 @@ use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Rated, Reliability,
     Sampled, Spread, coverage, gaussian, memorisation,
 };
-use tce_learn::Densities;
+use tce_learn::{Densities, rmse};
 use tce_nn::Device;
 
 use super::models::Models;
@@ -337,15 +337,15 @@ impl Work<'_> {
             Curve::of(&of_sources, &rated(&of_generated, models.generated))
         };
         let transition = models.abundant.and_then(tv);
-        let value = match self.simulator {
-            None => None,
-            Some((agent, shift)) => {
-                let gap = |t: &Transitions| -> Result<Rated> {
-                    let truth = tce_sim::simulate(agent, shift, &t.observations, &t.actions)?;
-                    Ok(Rated::certain(models.value_gap(t, &truth)))
-                };
-                Curve::of(&gap(&sources.sorted)?.grouped(&sources.episodes), &gap(&generated)?)
+        let value = match (self.simulator, &own.simulated) {
+            (Some((agent, shift)), Some(at_generated)) => {
+                let s = &sources.sorted;
+                let at_source = tce_sim::simulate(agent, shift, &s.observations, &s.actions)?;
+                let of_sources = Rated::certain(models.value_gap(s, &at_source)).grouped(&sources.episodes);
+                let gaps = models.value_gap(&own.rows, at_generated).into_iter().zip(&own.keep);
+                Curve::of(&of_sources, &Rated::certain(gaps.filter(|(_, keep)| **keep).map(|(gap, _)| gap).collect()))
             }
+            _ => None,
         };
         let held_out = models.held_out(&inputs.target.rows, inputs.agent);
         let alone = |t: &Transitions, densities: &[Densities]| {
@@ -478,10 +478,6 @@ fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
 /// As it is written: .1 and not .10000000149.
 fn decimal(y: f32) -> f64 {
     y.to_string().parse().unwrap_or(f64::from(y))
-}
-
-fn rmse(a: &[f32], b: &[f32]) -> f64 {
-    (a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / a.len().max(1) as f64).sqrt()
 }
 
 #[cfg(test)]

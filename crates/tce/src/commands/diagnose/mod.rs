@@ -6,7 +6,7 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::{FileError, read_if_there, write_atomically};
 use tce_data::Task;
-use tce_diagnosis::{AtBound, Diagnosis, Spread, Verdict};
+use tce_diagnosis::{AtBound, Diagnosis, Spread};
 use tce_learn::TransitionConfig;
 use tce_nn::cpu;
 
@@ -294,23 +294,17 @@ fn render_run(written: &Written) -> String {
             "copies: a generated row is nearer to a training row than a held-out row with probability {:.2} (copies: {:.2}); {}\n",
             m.probability,
             m.of_copies,
-            match m.verdict() {
-                Verdict::Copies => "they look like copies",
-                Verdict::Fresh => "they look like fresh rows",
-                Verdict::Beside => "they lie beside the data",
-            }
+            m.verdict()
         );
     }
     if let Some(c) = &d.choice {
-        let said = if c.told { "" } else { ", the default: models of the target rows cannot tell" };
         text += &format!(
-            "λ from the data alone: {}{said} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
-            c.lambda, c.least_bound, c.generated_alone
+            "λ from the data alone: {c} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
+            c.least_bound, c.generated_alone
         );
     }
     if let Some(c) = &d.choice_by_simulator {
-        let said = if c.told { "" } else { ", not told from others" };
-        text += &format!("λ by the simulator: {}{said}\n", c.lambda);
+        text += &format!("λ by the simulator: {c}\n");
     }
     for note in &d.notes {
         text += &format!("note: {note}\n");
