@@ -299,8 +299,8 @@ fn render_run(written: &Written) -> String {
     }
     if let Some(c) = &d.choice {
         text += &format!(
-            "λ from the data alone: {c} (discrepancy of values {:.4}; {:.4} with generated rows alone)\n",
-            c.least_bound, c.generated_alone
+            "λ from the data alone: {c}; least discrepancy of values {:.4} at λ = {}, with generated rows alone {:.4}\n",
+            c.least_bound, c.least, c.generated_alone
         );
     }
     if let Some(c) = &d.choice_by_simulator {
