@@ -108,13 +108,19 @@ fn caption(study: &Study, analysis: &Analysis) -> String {
     )
 }
 
+/// Cases of a warning that are listed: Markdown cannot fold the rest away.
+const CASES: usize = 10;
+
 /// The report's tables, warnings and finding in Markdown.
 pub fn markdown(study: &Study, analysis: &Analysis) -> String {
     let mut out = format!("# {}\n\n{}\n\n", md(&study.name), md(&headline(analysis)));
     for w in &analysis.warnings {
         out += &format!("> **Note.** {}\n", md(&w.text));
-        for d in &w.details {
+        for d in w.details.iter().take(CASES) {
             out += &format!("> - {}\n", md(d));
+        }
+        if w.details.len() > CASES {
+            out += &format!("> - and {} more, all of them in report.html\n", w.details.len() - CASES);
         }
         out += ">\n";
     }

@@ -283,6 +283,26 @@ fn whatever_is_wrong_is_said_first() {
     assert_eq!(og.over_seeds[2].point, 15.0);
 }
 
+/// Markdown cannot fold a list of hundreds away; the page has it.
+#[test]
+fn long_lists_of_what_is_missing_are_cut_in_markdown_alone() {
+    let root = tempfile::tempdir().unwrap();
+    let mut study = study(root.path());
+    for seed in 0..23 {
+        study.missing.push(Missing {
+            task: task(Agent::Hopper, Quality::Expert),
+            method: "tce-og".into(),
+            what: format!("tce-og, seed {}", 100 + seed),
+            why: "not done".into(),
+        });
+    }
+    let (analysis, page) = page(&study);
+    let text = tce_report::text::markdown(&study, &analysis);
+    assert!(text.contains("seed 109: not done") && !text.contains("seed 110"), "{text}");
+    assert!(text.contains("and 13 more, all of them in report.html"), "{text}");
+    assert!(page.contains("seed 122"));
+}
+
 #[test]
 fn methods_without_a_common_task_are_left_out_by_name() {
     let root = tempfile::tempdir().unwrap();
