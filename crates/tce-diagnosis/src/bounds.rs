@@ -6,8 +6,9 @@
 //! ```
 //!
 //! Both are a factor times λ d_source(λ) + (1 − λ) d_generated, with one discrepancy d per row. Source rows are either all of them (d does
-//! not depend on λ) or the λ share nearest to the target (Eq. 9; d grows with λ). The expectations are over the rows of the
-//! mixture, which stand for ρ_mix.
+//! not depend on λ) or the λ share nearest to the target (Eq. 9). The theorem's expectations are over ρ_mix; here the first is over the
+//! source's rows and the second over the generated ones, where each of the two dynamics is used. In Eq. 4, E_gen V is V at the one ŝ' of the
+//! row: its scatter counts as a discrepancy, so that d_generated is too large rather than too small.
 //!
 //! **The rule.** TCE leaves λ to the user: OG (λ = 0) ... NN. [`Choice::of`] takes the λ with the least bound, where d is measured by
 //! models of the target rows alone, so that no environment is needed. Such a d is the row's distance from what a *model* says, and
@@ -20,20 +21,28 @@
 //! ± (b − a) (u_between + u_generated + q √(se²_between + se²_generated))
 //! ```
 //!
-//! and only a difference beyond its ± is told. The standard errors count trajectories and not rows: rows of one trajectory are alike. q is the
-//! normal quantile at which nine comparisons that are all of equals tell a difference in one of twenty cases at most (Bonferroni). The rule takes the smallest λ whose bound is not told from the least one; where that
+//! and only a difference beyond its ± is told. The standard errors count trajectories and not rows: rows of one trajectory are alike. q is
+//! Student's quantile at which nine comparisons that are all of equals tell a difference in about one of twenty cases (Bonferroni), with the
+//! degrees of freedom of the fewer trajectories. The rule takes the smallest λ whose bound is not told from the least one; where that
 //! is 0, and not every other λ is told to be worse, the data do not say, and 0 stands as the paper's default.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+use statrs::distribution::{ContinuousCDF, StudentsT};
 
 /// The λ at which curves are computed.
 pub const GRID: [f64; 10] = [0.0, 0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0];
 
-/// q: Φ⁻¹(1 − .05 / (2 · 9)) for the nine λ beside the one that they are compared with.
-const QUANTILE: f64 = 2.773;
+/// The chance that one of the nine λ is told from the one that they are compared with, where all are equal.
+const CHANCE: f64 = 0.05;
+
+/// q for means of which the one with the fewest has `trajectories`.
+fn quantile(trajectories: usize) -> f64 {
+    let student = StudentsT::new(0.0, 1.0, trajectories as f64 - 1.0).expect("two trajectories at least");
+    student.inverse_cdf(1.0 - CHANCE / (2 * (GRID.len() - 1)) as f64)
+}
 
 /// One discrepancy per row, and how wrong it may be.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -105,9 +114,18 @@ impl Part {
     }
 }
 
-/// The square of the standard error of the mean d, c / (c − 1) Σ (Σ (d − mean))² / n², the inner sum over the rows of each of c trajectories.
-/// None for a single trajectory: it says nothing of others.
-fn error_squared(rated: &Rated) -> Option<f64> {
+/// How well a mean is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MeanError {
+    /// The square of its standard error.
+    pub squared: f64,
+    /// Trajectories that it is from.
+    pub trajectories: usize,
+}
+
+/// Of the mean d: c / (c − 1) Σ (Σ (d − mean))² / n², the inner sum over the rows of each of c trajectories. None for a single trajectory:
+/// it says nothing of others.
+fn mean_error(rated: &Rated) -> Option<MeanError> {
     let n = rated.gap.len() as f64;
     let mean = rated.gap.iter().sum::<f64>() / n;
     let mut sums = BTreeMap::<usize, f64>::new();
@@ -115,7 +133,8 @@ fn error_squared(rated: &Rated) -> Option<f64> {
         *sums.entry(*group).or_default() += d - mean;
     }
     let c = sums.len() as f64;
-    (sums.len() > 1).then(|| c / (c - 1.0) * sums.values().map(|s| s * s).sum::<f64>() / (n * n))
+    let squared = c / (c - 1.0) * sums.values().map(|s| s * s).sum::<f64>() / (n * n);
+    (sums.len() > 1).then_some(MeanError { squared, trajectories: sums.len() })
 }
 
 /// λ d_source(λ) + (1 − λ) d_generated for every λ of [`GRID`].
@@ -129,11 +148,10 @@ pub struct Curve {
     pub parts: Vec<Part>,
     /// The generated rows.
     pub generated: Part,
-    /// The square of the standard error of the mean of the source rows between the places a < b of the grid, at [a][b − a − 1]; None where they
-    /// are of one trajectory.
-    pub errors: Vec<Vec<Option<f64>>>,
+    /// Of the mean of the source rows between the places a < b of the grid, at [a][b − a − 1]; None where they are of one trajectory.
+    pub errors: Vec<Vec<Option<MeanError>>>,
     /// The same of the generated rows.
-    pub generated_error: Option<f64>,
+    pub generated_error: Option<MeanError>,
     /// Rows whose discrepancy is not a finite number, and which are left out: source and generated ones.
     pub lost: (usize, usize),
 }
@@ -149,14 +167,14 @@ impl Curve {
         let rows = |k: usize| if k == 0 { 0 } else { ((GRID[k] * s.gap.len() as f64).round() as usize).max(1) };
         let between = |a: usize, b: usize| s.select(rows(a)..rows(b));
         let part = |k: usize| if k == 0 { Part::default() } else { Part::of(&between(k - 1, k)) };
-        let errors = |a: usize| (a + 1..GRID.len()).map(|b| error_squared(&between(a, b))).collect();
+        let errors = |a: usize| (a + 1..GRID.len()).map(|b| mean_error(&between(a, b))).collect();
         let mut curve = Self {
             nearest: vec![],
             all: vec![],
             parts: (0..GRID.len()).map(part).collect(),
             generated: Part::of(&g),
             errors: (0..GRID.len()).map(errors).collect(),
-            generated_error: error_squared(&g),
+            generated_error: mean_error(&g),
             lost,
         };
         let (generated, whole) = (curve.generated.mean(), curve.source(GRID.len() - 1).mean());
@@ -179,10 +197,14 @@ impl Curve {
 
     /// How far `nearest` at two places a < b of [`GRID`] has to differ for the difference to be told; None where no difference could be.
     pub fn doubt_between(&self, a: usize, b: usize) -> Option<f64> {
-        let (part, g) = (self.between(a, b), &self.generated);
+        let (part, g) = (self.between(a, b), self.generated_error?);
         // Two places may share their rows where there are few.
-        let (doubt, error) = if part.rows == 0 { (0.0, 0.0) } else { (part.mean_doubt(), self.errors[a][b - a - 1]?) };
-        Some((GRID[b] - GRID[a]) * (doubt + g.mean_doubt() + QUANTILE * (error + self.generated_error?).sqrt()))
+        let (doubt, s) = match part.rows {
+            0 => (0.0, MeanError { squared: 0.0, ..g }),
+            _ => (part.mean_doubt(), self.errors[a][b - a - 1]?),
+        };
+        let error = quantile(s.trajectories.min(g.trajectories)) * (s.squared + g.squared).sqrt();
+        Some((GRID[b] - GRID[a]) * (doubt + self.generated.mean_doubt() + error))
     }
 
     /// Whether the bound at place `a` is told to be greater than the one at `b`.
@@ -193,8 +215,11 @@ impl Curve {
 
 /// What u is multiplied by, given mean d and u of held-out rows, whose true discrepancy is 0: their ratio, but never less than 1. u of a
 /// held-out row has to be that between models of which one at least has not seen it: models that have seen a row agree.
-pub fn calibration((d, u): (f64, f64)) -> f64 {
-    if u > 0.0 { (d / u).max(1.0) } else { 1.0 }
+pub fn calibration(held_out: Option<(f64, f64)>) -> f64 {
+    match held_out {
+        Some((d, u)) if u > 0.0 => (d / u).max(1.0),
+        _ => 1.0,
+    }
 }
 
 /// Both bounds, as far as they can be measured.
@@ -213,8 +238,8 @@ pub struct Bounds {
     /// See `transition_alone`; what the rule looks at.
     pub value_alone: Option<Curve>,
     /// Of target rows by models that did not see them: mean d, and how far those are from the models that did, what [`calibration`] is made
-    /// from.
-    pub held_out: (f64, f64),
+    /// from. None where they are no numbers.
+    pub held_out: Option<(f64, f64)>,
 }
 
 impl Bounds {
@@ -290,7 +315,7 @@ mod tests {
         assert!((curve.nearest[at(0.8)] - (0.8 * d + 0.2 * 0.4)).abs() < 1e-12);
         assert!((curve.all[at(0.4)] - (0.4 * 0.6 + 0.6 * 0.4)).abs() < 1e-12);
         assert_eq!((curve.lost, curve.parts.iter().map(|p| p.rows).sum::<usize>()), ((1, 1), 1000));
-        assert!((curve.generated_error.unwrap() - 0.01).abs() < 1e-12, "two rows at ±.1");
+        assert!((curve.generated_error.unwrap().squared - 0.01).abs() < 1e-12, "two rows at ±.1");
         assert_eq!(Curve::of(&Rated::default(), &Rated::certain(vec![1.0])), None);
     }
 
@@ -299,11 +324,12 @@ mod tests {
     fn rows_of_a_trajectory_count_once() {
         let gap: Vec<f64> = (0..100).map(|i| f64::from(i / 25)).collect();
         let group: Vec<usize> = (0..100).map(|i| i / 25).collect();
-        let four = error_squared(&Rated::certain(gap.clone()).grouped(&group)).unwrap();
-        let expected = error_squared(&Rated::certain(vec![0.0, 1.0, 2.0, 3.0])).unwrap();
-        assert!((four - expected).abs() < 1e-12 && (expected - 5.0 / 12.0).abs() < 1e-12);
-        assert!(error_squared(&Rated::certain(gap.clone())).unwrap() < expected / 20.0);
-        assert_eq!(error_squared(&Rated::certain(gap).grouped(&[7; 100])), None);
+        let four = mean_error(&Rated::certain(gap.clone()).grouped(&group)).unwrap();
+        let expected = mean_error(&Rated::certain(vec![0.0, 1.0, 2.0, 3.0])).unwrap();
+        assert!((four.squared - 5.0 / 12.0).abs() < 1e-12 && (expected.squared - 5.0 / 12.0).abs() < 1e-12);
+        assert_eq!((four.trajectories, expected.trajectories), (4, 4));
+        assert!(mean_error(&Rated::certain(gap.clone())).unwrap().squared < expected.squared / 20.0);
+        assert_eq!(mean_error(&Rated::certain(gap).grouped(&[7; 100])), None);
         let single = Rated::certain(vec![0.1; 1000]).grouped(&[7; 1000]);
         let choice = Choice::of(&Curve::of(&single, &Rated::certain(vec![5.0; 1000])).unwrap());
         assert_eq!((choice.lambda, choice.told, choice.least), (0.0, false, 1.0));
@@ -316,10 +342,14 @@ mod tests {
         let doubt: Vec<f64> = (0..1000).map(|i| if (400..600).contains(&i) { 0.5 } else { 9.0 }).collect();
         let generated = Rated { gap: vec![4.0, 6.0], doubt: vec![0.1, 0.3], group: vec![0, 1] };
         let curve = Curve::of(&Rated { gap, doubt, group: (0..1000).collect() }, &generated).unwrap();
-        // Squares of the standard errors: 1 / 199 between, 1 / 1 of the two generated rows.
-        let expected = 0.2 * (0.5 + 0.2 + 2.773 * (1.0 / 199.0 + 1.0f64).sqrt());
+        // Squares of the standard errors: 1 / 199 between, 1 / 1 of the two generated rows. Student with one degree of freedom is Cauchy.
+        let cauchy = (std::f64::consts::PI * (0.5 - 0.05 / 18.0)).tan();
+        let expected = 0.2 * (0.5 + 0.2 + cauchy * (1.0 / 199.0 + 1.0f64).sqrt());
         let at = |lambda: f64| GRID.iter().position(|l| *l == lambda).unwrap();
-        assert!((curve.doubt_between(at(0.4), at(0.6)).unwrap() - expected).abs() < 1e-12);
+        let found = curve.doubt_between(at(0.4), at(0.6)).unwrap();
+        assert!((found / expected - 1.0).abs() < 1e-6, "{found} is not {expected}");
+        // Many are normal: Φ⁻¹(1 − .05 / 18).
+        assert!((quantile(1_000_000) - 2.7729).abs() < 1e-3 && quantile(10) > 3.5);
         assert!((curve.nearest[at(0.6)] - curve.nearest[at(0.4)] - 0.2 * (2.0 - 5.0)).abs() < 1e-12);
     }
 
@@ -362,7 +392,7 @@ mod tests {
             value: None,
             transition_alone: None,
             value_alone: None,
-            held_out: (0.0, 0.0),
+            held_out: None,
         };
         assert!((bounds.transition_factor() - 99_000.0).abs() < 1e-6);
         assert!((bounds.value_factor() - 99.0).abs() < 1e-9);

@@ -30,9 +30,10 @@ pub struct Diagnosis {
     pub target_rows: usize,
     /// States of each domain that coverage is counted over, and covering rows; those are no reference rows.
     pub coverage_rows: usize,
-    /// Coverage by target rows of other episodes (of the same ones where they cannot be split, see `notes`): what fresh target rows
-    /// cover. None where rows are too few.
+    /// Coverage by as many other target rows. None where rows are too few.
     pub covered_by_target: Option<Coverage>,
+    /// Whether those are of other episodes, as fresh rows are.
+    pub covered_by_fresh: bool,
     /// Figures over y_max, ascending.
     pub bounds_of_y: Vec<AtBound>,
     /// The rows as they are drawn under the run's own y_max.
@@ -72,7 +73,7 @@ pub struct AtBound {
     pub y_max: f64,
     /// Rows that hold a number that is not finite. They are part of no figure but `rejected`.
     pub lost: usize,
-    /// Coverage by rows that pass the filter; None where too few do.
+    /// Coverage by rows that pass the filter; None where too few do, which `Diagnosis::notes` tell.
     pub coverage: Option<Coverage>,
     /// Share of rows that the filter rejects, lost ones among them.
     pub rejected: f64,

@@ -54,7 +54,8 @@ pub fn total_variation(p: Normals<'_>, q: Normals<'_>, streams: &Streams) -> Vec
                 lp - lq + 0.5 * (z * z - from_q * from_q)
             };
             let ratio: f64 = (0..dim).map(log_ratio).sum();
-            (1.0 - ratio.exp()).max(0.0)
+            // Not `max`, to which a model that has diverged would be as good as the best one.
+            (1.0 - ratio.exp()).clamp(0.0, 1.0)
         };
         z.chunks_exact(dim).map(draw).sum::<f64>() / DRAWS as f64
     };
@@ -101,5 +102,7 @@ mod tests {
         let far =
             total_variation(normals(&[0.0, 0.0], &[-5.0, 0.0], 2), normals(&[1.0, 0.0], &[-5.0, 0.0], 2), &streams);
         assert_eq!(far, [1.0], "sharp distributions at different places have nothing in common");
+        let lost = total_variation(normals(&[f32::NAN], &[0.0], 1), normals(&[0.0], &[0.0], 1), &streams);
+        assert!(lost[0].is_nan(), "no number is not the least one");
     }
 }

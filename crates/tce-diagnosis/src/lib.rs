@@ -18,7 +18,7 @@ pub mod gaussian;
 pub mod memorisation;
 mod numbers;
 
-pub use bounds::{Bounds, Choice, Curve, Part, Rated};
+pub use bounds::{Bounds, Choice, Curve, MeanError, Part, Rated};
 pub use coverage::Coverage;
 pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};
 pub use embedding::{Embedding, Group};

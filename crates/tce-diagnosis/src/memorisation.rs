@@ -29,8 +29,8 @@ use crate::numbers::Spread;
 
 /// Below this p generated rows are said to lie beside the data: three of four are farther from a training row than a held-out row is.
 pub const BESIDE: f64 = 0.25;
-/// From this share of identical rows on rows are said to be copies, whatever p is: chance makes none among continuous numbers.
-pub const IDENTICAL: f64 = 0.01;
+/// From this share on it is said that rows are training rows, whatever p is: chance makes none among continuous numbers.
+pub const IDENTICAL: f64 = 0.001;
 
 /// How near generated rows are to training rows, beside rows that the generator did not see.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -59,24 +59,28 @@ pub enum Verdict {
     Beside,
 }
 
-impl fmt::Display for Verdict {
+/// A sentence without its point.
+impl fmt::Display for Memorisation {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str(match self {
-            Verdict::Copies => "generated rows look like copies of training rows",
-            Verdict::Fresh => "generated rows are no copies of training rows",
-            Verdict::Beside => {
+        let some = self.identical >= IDENTICAL;
+        f.write_str(match (self.verdict(), some) {
+            (Verdict::Copies, _) => "generated rows look like copies of training rows",
+            (Verdict::Fresh, false) => "generated rows are no copies of training rows",
+            (Verdict::Fresh, true) => "generated rows are as far from the training rows as held-out rows are",
+            (Verdict::Beside, false) => {
                 "generated rows are no copies, but lie farther from the training rows than held-out rows do"
             }
-        })
+            (Verdict::Beside, true) => "generated rows lie farther from the training rows than held-out rows do",
+        })?;
+        if some { write!(f, "; {:.1} % of them are training rows", 100.0 * self.identical) } else { Ok(()) }
     }
 }
 
 impl Memorisation {
-    /// What p says: copies from half the way between ½ and what copies get or from [`IDENTICAL`] exact ones on, beside the data below
-    /// [`BESIDE`].
+    /// What p says: copies from half the way between ½ and what copies get, beside the data below [`BESIDE`].
     pub fn verdict(&self) -> Verdict {
         match self.probability {
-            p if p > (0.5 + self.of_copies) / 2.0 || self.identical >= IDENTICAL => Verdict::Copies,
+            p if p > (0.5 + self.of_copies) / 2.0 => Verdict::Copies,
             p if p < BESIDE => Verdict::Beside,
             _ => Verdict::Fresh,
         }
@@ -208,7 +212,8 @@ mod tests {
             assert_eq!(judge(&training, &far, count).verdict(), Verdict::Beside, "{count} episodes");
             // Every fiftieth of them a training row: too few for p, and nothing that chance does.
             far.chunks_exact_mut(4).zip(training.chunks_exact(4)).step_by(50).for_each(|(x, t)| x.copy_from_slice(t));
-            assert_eq!(judge(&training, &far, count).verdict(), Verdict::Copies, "{count} episodes");
+            let said = judge(&training, &far, count).to_string();
+            assert!(said.ends_with("than held-out rows do; 2.0 % of them are training rows"), "{said}");
         }
     }
 

@@ -5,7 +5,7 @@ use maud::{Markup, html};
 use tce_data::Task;
 use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::coverage::NEIGHBOUR;
-use tce_diagnosis::memorisation::{BESIDE, IDENTICAL};
+use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread,
 };
@@ -78,12 +78,13 @@ fn lede(d: &Diagnosis) -> String {
         let source = |c: Option<Coverage>| c.and_then(|c| c.source).map_or("–".into(), percent);
         text += &format!(
             "With y_max = {} generated rows cover {} of the target's and {} of the source's states ({} and {} at y_max = 0; as many \
-             fresh target rows {} and {}).",
+             {} {} and {}).",
             plain(d.y_max),
             target(own.coverage),
             source(own.coverage),
             target(zero.coverage),
             source(zero.coverage),
+            if d.covered_by_fresh { "rows of other target episodes" } else { "other target rows" },
             target(d.covered_by_target),
             source(d.covered_by_target),
         );
@@ -95,13 +96,12 @@ fn lede(d: &Diagnosis) -> String {
         }
     }
     if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
-        let verdict = m.verdict().to_string();
-        text += &format!(" {}.", verdict.replacen("generated", "Generated", 1));
+        text += &format!(" {}.", m.to_string().replacen("generated", "Generated", 1));
     }
     if let Some(c) = &d.choice {
         text += &match c {
             Choice { told: false, .. } => {
-                " The data alone do not say which λ is best: models of the target rows are too much in doubt."
+                " The data alone do not say which λ is best: models of the target rows, or the samples, are too much in doubt."
                     .to_owned()
             }
             Choice { lambda: 0.0, .. } => " The data alone say: λ = 0, generated rows without source rows.".to_owned(),
@@ -173,6 +173,8 @@ fn coverage(d: &Diagnosis) -> Markup {
         let value = d.covered_by_target.and_then(of);
         d.bounds_of_y.iter().map(|b| value.and_then(|v| bare(b.y_max, v))).collect::<Vec<_>>()
     };
+    let others =
+        if d.covered_by_fresh { "the same by rows of other target episodes" } else { "the same by other target rows" };
     figure(
         "Coverage",
         "of states, by generated rows",
@@ -181,9 +183,9 @@ fn coverage(d: &Diagnosis) -> Markup {
         false,
         vec![
             line("target states", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
-            line("the same by target rows of other episodes", "f0", without(&|c| Some(c.target)).into_iter()),
+            line(others, "f0", without(&|c| Some(c.target)).into_iter()),
             line("source states", "m1", over(&|b| b.coverage.and_then(|c| c.source)).into_iter()),
-            line("the same by target rows of other episodes", "f1", without(&|c| c.source).into_iter()),
+            line(others, "f1", without(&|c| c.source).into_iter()),
         ],
     )
 }
@@ -370,7 +372,7 @@ fn table(d: &Diagnosis) -> Markup {
             ));
         }
         let text = "|ΔV| of target rows by models that lack them / how far those are there from models that do not";
-        rows.push((text, format!("{} / {}", number(b.held_out.0), number(b.held_out.1))));
+        rows.extend(b.held_out.map(|p| (text, pair(p))));
     }
     if let Some(c) = &d.choice {
         rows.push(("λ of the rule, from the data alone", c.to_string()));
@@ -455,7 +457,7 @@ fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) -> Markup {
         h3 { "λ from the data alone" }
         p {
             "The rule takes the λ with the least bound of Theorem 1 on values, measured by models of the target rows alone. Where the bounds \
-             differ by no more than these models are in doubt, it cannot tell, and λ = 0 stands by default. Beside it, what the simulator \
+             differ by no more than these models and the samples are in doubt, it cannot tell, and λ = 0 stands by default. Beside it, what the simulator \
              would have said, and in hindsight the mixture of this study with the highest mean score, where there are two that differ in \
              λ alone."
         }
@@ -497,7 +499,8 @@ fn explanation() -> Markup {
                 b { "Coverage. " } "A state of either domain is covered if a generated state lies within the distance of its "
                 (NEIGHBOUR) "th nearest neighbour among the states of its own domain (Naeem et al. 2020); the paper does not define its \
                  curve. All sets have the same number of rows, so that rows of the very same distribution cover 97 %. What is covered of the \
-                 target is one half of its episodes, and the covering target rows are of the other half; the generator saw both."
+                 target is one half of its rows, and the covering target rows are of the other half: whole episodes where they can be split \
+                 evenly. The generator saw both."
             }
             p {
                 b { "Reliability. " } "Lines are medians, bands reach from the 10th to the 90th percentile. Abundant rows are what the \
@@ -508,10 +511,11 @@ fn explanation() -> Markup {
                 b { "Copies. " } "The rows of every episode, and as large a share of the generated rows, are measured by their nearest training row of \
                  the other episodes (after Meehan et al. 2020). P is the probability that the generated row is the nearer one: one half for \
                  fresh rows. Rows are called copies from half the way between that and what copies get, and beside the data below "
-                (BESIDE) ". Where " (percent(IDENTICAL)) " of them are exact copies they are called so whatever P is. Where every episode is a place of its own, fresh rows get the P of copies."
+                (BESIDE) ". Exact copies are counted as well. Where every episode is a place of its own, fresh rows get the P of copies."
             }
             p {
-                b { "Theorem 1. " } "Expectations over ρ" sub { "mix" } " are means over rows. V is that of implicit Q-learning on target and generated \
+                b { "Theorem 1. " } "Expectations over ρ" sub { "mix" } " are means over source rows for the first term and over generated rows for the \
+                 second; V at one generated successor stands for its expectation, so that the second is an upper estimate. V is that of implicit Q-learning on target and generated \
                  rows. By the data alone, the target's dynamics are models of the target rows: for values three that lack a third of the \
                  rows each, whole episodes where they are even enough, V at the step that they predict, and for total variation one of all rows. Otherwise they are the simulator, and \
                  for total variation a model of abundant rows. The band is the doubt: the rule tells a λ from 0 where \

@@ -115,6 +115,7 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
         target_rows: 5000,
         coverage_rows: 45,
         covered_by_target: Some(Coverage { target: 0.96, source: Some(0.05) }),
+        covered_by_fresh: true,
         bounds_of_y: [0.0, 0.1, 0.2].map(at).into(),
         sampled: Sampled {
             y_kept: histogram(5),
@@ -141,7 +142,7 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
             value: curve.clone(),
             transition_alone: curve.clone(),
             value_alone: curve,
-            held_out: (0.1, 0.05),
+            held_out: Some((0.1, 0.05)),
         }),
         notes: vec!["a <note>".into()],
     }

@@ -156,13 +156,16 @@ fn the_seed_asked_for_is_the_one_that_is_measured() {
     let stages = fs::read_dir(dir.path().join("out/stages")).unwrap().map(|e| e.unwrap().path());
     let labels = stages.into_iter().find(|p| p.file_name().unwrap().to_str().unwrap().starts_with("labels-")).unwrap();
     let done: Value = serde_json::from_slice(&fs::read(labels.join("done.json")).unwrap()).unwrap();
+    let mut distances = Vec::new();
     for seed in [0, 1] {
         let name = seed.to_string();
         let found = tce_json(dir.path(), &[&["diagnose", place, "--seed", &name][..], &data, FEW].concat());
         assert_eq!(found["seed"], seed);
         let expected = &done["summary"][seed]["action_rmse"];
         assert!(expected.is_number() && found["labels"]["held_out_action"][0] == *expected, "{found}");
+        distances.push(at(&found, 0.2)["kept"]["distance"]["median"].as_f64().unwrap());
     }
+    assert_ne!(distances[0], distances[1], "rows of the other seed's generator");
 }
 
 /// A filter that leaves nothing is refused by name.

@@ -14,7 +14,7 @@ use tce_diagnosis::{
 use tce_learn::{Densities, rmse};
 use tce_nn::Device;
 
-use super::models::Models;
+use super::models::{Models, finite};
 use super::rows::{Batch, Sampler};
 use super::{Options, Subject, generator};
 use crate::config::SourceRows;
@@ -116,7 +116,12 @@ impl Work<'_> {
                  and Theorem 1 by models of the target rows alone."
             ));
         }
-        let references = self.references(&streams, sources.as_ref(), own.kept())?;
+        // As many as every bound has, but for those of which the filter leaves next to nothing.
+        let kept = batches.iter().map(Batch::kept).filter(|k| 2 * k >= own.kept()).min().expect("the run's own");
+        let references = self.references(&streams, sources.as_ref(), kept)?;
+        for (y, batch) in grid.iter().zip(&batches).filter(|(_, b)| 2 * b.kept() < own.kept()) {
+            notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", batch.kept()));
+        }
         match &references {
             None => notes.push("There are too few rows for a coverage.".into()),
             Some(r) if !r.by_episode => notes.push(
@@ -154,7 +159,7 @@ impl Work<'_> {
         if theorem.is_none() {
             notes.push("Without source rows there is no λ to choose.".into());
         }
-        notes.extend(blown_up(&bounds_of_y, decimal(config.generator.y_max), theorem.as_ref()));
+        notes.extend(left_out(own, theorem.as_ref(), self.simulator.is_some()));
         let mut states = Vec::new();
         for y in [0.0, config.generator.y_max, *grid.last().expect("a grid")] {
             if states.iter().all(|(other, _)| *other != decimal(y)) {
@@ -173,6 +178,7 @@ impl Work<'_> {
             target_rows: target.len(),
             coverage_rows: references.as_ref().map_or(0, |r| r.rows),
             covered_by_target,
+            covered_by_fresh: references.as_ref().is_some_and(|r| r.by_episode),
             bounds_of_y,
             sampled: self.sampled(own),
             transitions: self.picture(own, sources.as_ref(), &streams, true),
@@ -200,11 +206,9 @@ impl Work<'_> {
             if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
         let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
         let measured = pick(&order, "sources");
-        let of_rows: Vec<usize> =
-            all.episodes().iter().enumerate().flat_map(|(k, e)| vec![k; e.end - e.start]).collect();
         Ok(Some(Sources {
             sorted: all.select(&measured),
-            episodes: measured.iter().map(|&i| of_rows[i]).collect(),
+            episodes: episodes_of(all, &measured),
             nearest: all.select(&pick(&order[..near], "nearest")),
             others: all.select(&others(all.len(), &measured)),
         }))
@@ -305,7 +309,7 @@ impl Work<'_> {
         let errors = |rows: Option<&Transitions>| -> Result<Option<(f64, f64)>> {
             let Some(rows) = rows.filter(|r| !r.is_empty()) else { return Ok(None) };
             let found = self.sampler.label(&rows.observations, &rows.next_observations)?;
-            Ok(Some((rmse(&found.actions, &rows.actions), rmse(&found.rewards, &rows.rewards))))
+            Ok(finite((rmse(&found.actions, &rows.actions), rmse(&found.rewards, &rows.rewards))))
         };
         let terminal = own.simulated.as_ref().and_then(|s| {
             let known: Vec<usize> = (0..own.len()).filter(|&i| own.keep[i] && s.held(i)).collect();
@@ -313,8 +317,8 @@ impl Work<'_> {
             (!known.is_empty()).then(|| wrong as f64 / known.len() as f64)
         });
         Ok(Labels {
-            held_out_action: held_out.map(|e| (e.action_rmse, e.action_std)),
-            held_out_reward: held_out.map(|e| (e.reward_rmse, e.reward_std)),
+            held_out_action: held_out.and_then(|e| finite((e.action_rmse, e.action_std))),
+            held_out_reward: held_out.and_then(|e| finite((e.reward_rmse, e.reward_std))),
             at_source: errors(models.at_source.as_ref())?,
             at_generated: errors(models.at_generated.as_ref())?,
             terminal,
@@ -368,19 +372,44 @@ impl Work<'_> {
     }
 }
 
-/// What is said of rows in which the physics blew up: they are missing in the medians.
-fn blown_up(bounds: &[AtBound], own: f64, theorem: Option<&Bounds>) -> Vec<String> {
-    let of = |r: &Reliability| r.consistency.map_or(0, |c| c.lost);
-    let lost = bounds.iter().find(|b| b.y_max == own).map_or(0, |b| of(&b.kept) + b.outliers.as_ref().map_or(0, of));
-    let rows = (lost > 0).then(|| {
-        format!(
-            "The simulator's physics blew up in {lost} generated rows at y_max = {own}; medians and percentiles leave them out."
-        )
-    });
-    let curves = theorem.and_then(|t| t.value.as_ref()).map(|c| c.lost).filter(|l| *l != (0, 0));
-    let curves = curves
-        .map(|(s, g)| format!("It blew up in {s} source and {g} generated rows of Theorem 1, which leaves them out."));
-    rows.into_iter().chain(curves).collect()
+/// What is said of rows that are no part of a figure, and of bounds that there are none of.
+fn left_out(own: &Batch, theorem: Option<&Bounds>, simulator: bool) -> Vec<String> {
+    let mut notes = Vec::new();
+    let lost = own.simulated.as_ref().map_or(0, |s| (0..own.len()).filter(|&i| !s.held(i)).count());
+    if lost > 0 {
+        notes.push(format!(
+            "The simulator's physics blew up in {lost} generated rows at the run's own y_max; medians and percentiles leave them out."
+        ));
+    }
+    let Some(theorem) = theorem else { return notes };
+    let Bounds { value, value_alone, transition, transition_alone, .. } = theorem;
+    for (what, curve, expected) in [
+        ("on values by the simulator", value, simulator),
+        ("on values by the data alone", value_alone, true),
+        ("on transitions by the simulator", transition, simulator),
+        ("on transitions by the data alone", transition_alone, true),
+    ] {
+        match curve {
+            None if expected => notes.push(format!(
+                "Theorem 1's bound {what} is missing: the discrepancy is a finite number in no source row, or in no generated one; \
+                 a model has diverged."
+            )),
+            Some(c) if c.lost != (0, 0) => notes.push(format!(
+                "Theorem 1's bound {what} leaves out {} source and {} generated rows, whose discrepancy is no finite number.",
+                c.lost.0, c.lost.1
+            )),
+            _ => (),
+        }
+    }
+    let single = |c: &Curve| c.generated_error.is_none() || c.errors[0].iter().any(Option::is_none);
+    if value_alone.as_ref().is_some_and(single) {
+        notes.push(
+            "The source's nearest rows, or the generated ones, are of a single trajectory, which says nothing of others: λ = 0 cannot be \
+             told from every other λ."
+                .into(),
+        );
+    }
+    notes
 }
 
 /// One number per row of a batch, for every figure that can be measured.
@@ -461,6 +490,12 @@ fn halves(t: &Transitions, streams: &Streams) -> (Vec<usize>, Vec<usize>, bool) 
     (first, second, true)
 }
 
+/// The episode of each of the rows at `places`.
+fn episodes_of(t: &Transitions, places: &[usize]) -> Vec<usize> {
+    let all: Vec<usize> = t.episodes().iter().enumerate().flat_map(|(k, e)| vec![k; e.end - e.start]).collect();
+    places.iter().map(|&i| all[i]).collect()
+}
+
 /// Which of 0 .. `count` are not among `places`.
 fn others(count: usize, places: &[usize]) -> Vec<usize> {
     let mut free = vec![true; count];
@@ -491,6 +526,44 @@ mod tests {
         }
         let (first, second, by_episode) = halves(&t, &Streams::new(1));
         (first, second, by_episode, t)
+    }
+
+    #[test]
+    fn rows_know_their_episode() {
+        let (.., t) = halves_of(&[2, 3, 1]);
+        assert_eq!(episodes_of(&t, &[5, 0, 3, 1, 4, 2]), [2, 0, 1, 0, 1, 1]);
+    }
+
+    /// Every figure that is missing has a note.
+    #[test]
+    fn what_is_left_out_is_told() {
+        let t = halves_of(&[1, 1]).3;
+        let held = |rewards: Vec<f32>| tce_sim::Simulated { rewards, ..Default::default() };
+        let batch =
+            |simulated| Batch { rows: t.clone(), keep: vec![true; 2], labels: vec![0.0; 2], simulated, lost: 0 };
+        let curve = |sources: &[f64]| Curve::of(&Rated::certain(sources.to_vec()), &Rated::certain(vec![1.0, 2.0]));
+        let rows: Vec<f64> = (0..1000).map(f64::from).collect();
+        let with = |value: Option<Curve>, value_alone: Option<Curve>| Bounds {
+            discount: 0.9,
+            r_max: 1.0,
+            transition: curve(&rows),
+            value,
+            transition_alone: curve(&rows),
+            value_alone,
+            held_out: None,
+        };
+        let notes = |b: &Batch, t: &Bounds| left_out(b, Some(t), true).join("\n");
+        let whole = with(curve(&rows), curve(&rows));
+        assert_eq!(notes(&batch(Some(held(vec![1.0, 2.0]))), &whole), "");
+        assert!(notes(&batch(Some(held(vec![1.0, f32::NAN]))), &whole).contains("blew up in 1 generated rows"));
+        let none = batch(None);
+        assert!(
+            notes(&none, &with(curve(&[f64::NAN]), curve(&rows))).contains("on values by the simulator is missing")
+        );
+        assert!(!left_out(&none, Some(&with(None, curve(&rows))), false).join("").contains("missing"));
+        let one = notes(&none, &with(curve(&rows), curve(&[&rows[..], &[f64::INFINITY]].concat())));
+        assert!(one.contains("on values by the data alone leaves out 1 source and 0 generated rows"), "{one}");
+        assert!(notes(&none, &with(curve(&rows), curve(&rows[..50]))).contains("are of a single trajectory"));
     }
 
     #[test]

@@ -235,11 +235,16 @@ impl Models {
 
     /// Mean gap of target rows by the model that lacks them, and how far that is from the other two: how much of a model's error their
     /// disagreement shows.
-    pub fn held_out(&self, target: &Transitions, agent: Option<Agent>) -> (f64, f64) {
+    pub fn held_out(&self, target: &Transitions, agent: Option<Agent>) -> Option<(f64, f64)> {
         let own = self.values(&target.next_observations, &target.terminals);
         let densities = self.densities(&target.observations, &target.actions);
-        held_out_rates(&own, &self.predicted_values(target, &densities, agent), &thirds(target))
+        finite(held_out_rates(&own, &self.predicted_values(target, &densities, agent), &thirds(target)))
     }
+}
+
+/// What JSON can hold: models that have diverged say nothing.
+pub fn finite(pair: (f64, f64)) -> Option<(f64, f64)> {
+    (pair.0.is_finite() && pair.1.is_finite()).then_some(pair)
 }
 
 /// |own − other| where the physics held; NaN elsewhere, and not the |own| that an episode which is over would leave.

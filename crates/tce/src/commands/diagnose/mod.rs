@@ -292,9 +292,7 @@ fn render_run(written: &Written) -> String {
     if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
         text += &format!(
             "copies: a generated row is nearer to a training row than a held-out row with probability {:.2} (copies: {:.2}); {}\n",
-            m.probability,
-            m.of_copies,
-            m.verdict()
+            m.probability, m.of_copies, m
         );
     }
     if let Some(c) = &d.choice {
