@@ -49,18 +49,21 @@ def read(sweep):
         }
 
 
+def kind(run):
+    return (run["method"], run["steps"], run["standardised"])
+
+
 def key(run):
-    return (run["task"], run["method"], run["seed"], run["steps"], run["standardised"])
+    return (run["task"], run["seed"], *kind(run))
 
 
 def table(runs):
-    methods = dict.fromkeys((r["method"], r["steps"], r["standardised"]) for r in runs)
     yield "| method | " + " | ".join(TASKS) + " |"
     yield "|---" * (len(TASKS) + 1) + "|"
-    for method, steps, standardised in methods:
+    for method, steps, standardised in dict.fromkeys(map(kind, runs)):
         cells = []
         for task in TASKS:
-            scores = [r["score"] for r in runs if key(r)[1:2] + key(r)[3:] == (method, steps, standardised) and r["task"].startswith(task)]
+            scores = [r["score"] for r in runs if kind(r) == (method, steps, standardised) and r["task"].startswith(task)]
             spread = f" ± {pstdev(scores):.1f}" if len(scores) > 1 else ""
             cells.append(f"{mean(scores):.1f}{spread} ({len(scores)})" if scores else "")
         name = method + ("" if steps == 50_000 else f", {steps} updates") + ("" if standardised else ", raw observations")
@@ -68,11 +71,12 @@ def table(runs):
 
 
 def main():
-    runs = json.loads(KEPT.read_text()) if KEPT.exists() else []
-    for folder in sys.argv[1:]:
-        found = {key(r): r for r in read(pathlib.Path(folder))}
-        runs = [r for r in runs if key(r) not in found] + list(found.values())
-    runs.sort(key=lambda r: (r["method"], not r["standardised"], r["steps"], r["task"], r["seed"]))
+    kept = {key(r): r for r in (json.loads(KEPT.read_text()) if KEPT.exists() else [])}
+    for run in (run for folder in sys.argv[1:] for run in read(pathlib.Path(folder))):
+        # The same policy is the same run: its processor is the one that it was trained on, and not the one that reads it again.
+        if kept.get(key(run), {}).get("policy") != run["policy"]:
+            kept[key(run)] = run
+    runs = sorted(kept.values(), key=lambda r: (r["method"], not r["standardised"], r["steps"], r["task"], r["seed"]))
     if sys.argv[1:]:
         text = ",\n".join(json.dumps(r) for r in runs)
         temporary = KEPT.with_suffix(".new")

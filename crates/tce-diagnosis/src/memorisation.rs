@@ -30,7 +30,7 @@ use crate::numbers::Spread;
 /// Below this p generated rows are said to lie beside the data: three of four are farther from a training row than a held-out row is.
 pub const BESIDE: f64 = 0.25;
 /// From this share on it is said that rows are training rows, whatever p is: chance makes none among continuous numbers.
-pub const IDENTICAL: f64 = 0.001;
+const IDENTICAL: f64 = 0.001;
 
 /// How near generated rows are to training rows, beside rows that the generator did not see.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -119,9 +119,6 @@ impl Work<'_> {
         // As many as every bound has, but for those of which the filter leaves next to nothing.
         let kept = batches.iter().map(Batch::kept).filter(|k| 2 * k >= own.kept()).min().expect("the run's own");
         let references = self.references(&streams, sources.as_ref(), kept)?;
-        for (y, batch) in grid.iter().zip(&batches).filter(|(_, b)| 2 * b.kept() < own.kept()) {
-            notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", batch.kept()));
-        }
         match &references {
             None => notes.push("There are too few rows for a coverage.".into()),
             Some(r) if !r.by_episode => notes.push(
@@ -145,10 +142,14 @@ impl Work<'_> {
             let figures = Figures::of(batch, distances, &models, &step, &self.units().live)?;
             let kept = batch.kept_rows();
             let judge = |h: &memorisation::HeldOut| h.judge(&pairs(self.units(), &kept), &streams);
+            let coverage = covered(&kept)?;
+            if references.is_some() && coverage.is_none() {
+                notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", kept.len()));
+            }
             bounds_of_y.push(AtBound {
                 y_max: decimal(y),
                 lost: batch.lost,
-                coverage: covered(&kept)?,
+                coverage,
                 rejected: batch.rejected(),
                 memorisation: held_out.as_ref().map(judge).transpose()?.flatten(),
                 kept: figures.reliability(batch, true),
@@ -518,26 +519,17 @@ fn decimal(y: f32) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn halves_of(lengths: &[usize]) -> (Vec<usize>, Vec<usize>, bool, Transitions) {
-        let mut t = Transitions::new(1, 1);
-        for &length in lengths {
-            (0..length).for_each(|i| t.push(&[0.0], &[0.0], 0.0, &[0.0], false, i + 1 == length));
-        }
-        let (first, second, by_episode) = halves(&t, &Streams::new(1));
-        (first, second, by_episode, t)
-    }
+    use crate::diagnosis::models::tests::log;
 
     #[test]
     fn rows_know_their_episode() {
-        let (.., t) = halves_of(&[2, 3, 1]);
-        assert_eq!(episodes_of(&t, &[5, 0, 3, 1, 4, 2]), [2, 0, 1, 0, 1, 1]);
+        assert_eq!(episodes_of(&log(&[2, 3, 1]), &[5, 0, 3, 1, 4, 2]), [2, 0, 1, 0, 1, 1]);
     }
 
     /// Every figure that is missing has a note.
     #[test]
     fn what_is_left_out_is_told() {
-        let t = halves_of(&[1, 1]).3;
+        let t = log(&[1, 1]);
         let held = |rewards: Vec<f32>| tce_sim::Simulated { rewards, ..Default::default() };
         let batch =
             |simulated| Batch { rows: t.clone(), keep: vec![true; 2], labels: vec![0.0; 2], simulated, lost: 0 };
@@ -576,7 +568,8 @@ mod tests {
             (vec![50, 5], false),
             (vec![997, 1, 1, 1], false),
         ] {
-            let (first, second, by_episode, t) = halves_of(&lengths);
+            let t = log(&lengths);
+            let (first, second, by_episode) = halves(&t, &Streams::new(1));
             assert_eq!(by_episode, whole, "{lengths:?}");
             let mut all = [first.clone(), second.clone()].concat();
             all.sort_unstable();

@@ -308,10 +308,11 @@ fn thirds(t: &Transitions) -> Vec<usize> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn log(lengths: &[usize]) -> Transitions {
+    /// A table of episodes of these lengths.
+    pub fn log(lengths: &[usize]) -> Transitions {
         let mut t = Transitions::new(1, 1);
         for &length in lengths {
             (0..length).for_each(|i| t.push(&[0.0], &[0.0], 0.0, &[0.0], false, i + 1 == length));
