@@ -16,10 +16,11 @@
 //! | - | `lr` | 3e-4 | ODRL |
 //! | - | `steps` | 7000 | ODRL |
 //! | - | `batch` | 128 target rows, 127 source rows for all of them | ODRL |
-//! | - | `mode` | corrected | published: φ and ψ stay as they were drawn |
+//! | - | `mode`, `code` | corrected | published, odrl: φ and ψ stay as they were drawn; published, authors: w is its mean |
 //!
-//! **Published**: ODRL defines the training of φ and ψ and never calls it, so that random networks choose. (The repository of IGDF's
-//! authors trains them, and broadcasts a mask over the weights instead; that second defect is not offered here.)
+//! **Published**: there are two public codes. ODRL defines the training of φ and ψ and never calls it, so that random networks
+//! choose. IGDF's authors train them, and multiply weights `[N, 1]` by squared errors `[N]`: the mean of that N × N matrix is the
+//! mean weight times L_Q, and no row weighs more than another.
 
 use std::path::Path;
 
@@ -30,19 +31,32 @@ use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
-use crate::losses::binary_cross_entropy;
+use crate::losses::{binary_cross_entropy, member_mean};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{Selected, host_from, need_others};
 use crate::training::{Learner, Meter, Place, prepare};
 
+/// Whose code [`Mode::Published`] follows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Code {
+    /// φ and ψ are never trained.
+    #[default]
+    Odrl,
+    /// Weights are broadcast over the rows.
+    Authors,
+}
+
 /// The configuration of [`Igdf`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct IgdfConfig {
-    /// Whether φ and ψ are trained.
+    /// As meant, or with the defect of `code`.
     pub mode: Mode,
+    /// Whose defect; nothing where `mode` is corrected.
+    pub code: Code,
     /// ξ
     pub keep: f64,
     /// α
@@ -61,12 +75,17 @@ pub struct IgdfConfig {
 
 impl Default for IgdfConfig {
     fn default() -> Self {
-        let (mode, hidden) = (Mode::default(), vec![256, 256]);
-        Self { mode, keep: 0.75, weight: 1.0, features: 64, hidden, lr: 3e-4, steps: 7000, batch: 128 }
+        let (mode, code, hidden) = (Mode::default(), Code::default(), vec![256, 256]);
+        Self { mode, code, keep: 0.75, weight: 1.0, features: 64, hidden, lr: 3e-4, steps: 7000, batch: 128 }
     }
 }
 
 impl IgdfConfig {
+    /// Whether the defect of `code` is trained with.
+    fn as_in(&self, code: Code) -> bool {
+        self.mode == Mode::Published && self.code == code
+    }
+
     /// Refuses numbers out of range.
     ///
     /// # Errors
@@ -172,7 +191,7 @@ impl Igdf {
         config.check()?;
         need_others("IGDF", buffer.members())?;
         let mut encoders = Encoders::new(buffer, config, device);
-        if config.mode == Mode::Corrected {
+        if !config.as_in(Code::Odrl) {
             // Split evenly: one source row less than target rows.
             let rows = Buffer::new(buffer.members().to_vec(), 2 * config.batch - 1)?.with_stream("igdf batch");
             if !prepare(&mut encoders, &rows, config.steps, "IGDF encoders", place, device)? {
@@ -192,7 +211,11 @@ impl Shape for Encoders {
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>) {
         let (keep, weight) = (self.config.keep, self.config.weight as f32);
-        Selected::new(batch, &self.scores(batch), keep, |score| (weight * score).exp()).recorded(meter)
+        let mut selected = Selected::new(batch, &self.scores(batch), keep, |score| (weight * score).exp());
+        if self.config.as_in(Code::Authors) {
+            selected.weights = member_mean(selected.weights.clone()).expand(selected.weights.dims());
+        }
+        selected.recorded(meter)
     }
 
     fn save(&self, state: &mut NamedParameters) {
@@ -207,6 +230,10 @@ impl Shape for Encoders {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::buffer::Member;
+    use std::sync::Arc;
+    use tce_base::Streams;
+    use tce_data::{Standardizer, Transitions};
     use tce_nn::{cpu, host, tensor};
 
     /// Against the definition, a matrix of N rows and 1 + M columns.
@@ -225,6 +252,36 @@ mod tests {
         let t = |v: &[f32], n: usize| tensor(v.to_vec(), [1, n, 2], &cpu());
         let loss = host(contrast(t(&phi, 2), t(&psi, 2), t(&others, 3)))[0] as f64;
         assert!((loss - expected / 8.0).abs() < 1e-6, "{loss} is not {}", expected / 8.0);
+    }
+
+    /// The same encoders on the same batch: the authors' defect leaves the choice of rows as it is, and of their weights the mean.
+    #[test]
+    fn the_authors_code_weighs_all_rows_alike() {
+        let mut t = Transitions::new(2, 1);
+        for i in 0..40 {
+            let x = i as f32 / 7.0;
+            t.push(&[x.sin(), x.cos()], &[(2.0 * x).sin()], x, &[(3.0 * x).sin(), x.cos()], false, i % 10 == 9);
+        }
+        let t = Arc::new(t);
+        let (streams, standardizer) = (Streams::new(1), Standardizer::fit(&t.observations, 2));
+        let parts = vec![t.clone(), t];
+        let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
+        let buffer = Buffer::new(vec![member], 16).unwrap();
+        let batch = buffer.sample(3, &cpu());
+        let shaped = |mode| {
+            let small = IgdfConfig { hidden: vec![8], features: 4, steps: 3, batch: 4, ..IgdfConfig::default() };
+            let config = IgdfConfig { mode, code: Code::Authors, ..small };
+            let iql = IqlConfig { hidden: vec![8], ..IqlConfig::default() };
+            let igdf = Igdf::new(&buffer, &config, &iql, Regulariser::None, 1, Place::NONE, &cpu());
+            let mut igdf = igdf.unwrap().unwrap();
+            let (batch, weights) = igdf.shape.shape(&igdf.iql, &batch, 3, &mut Meter::default());
+            (batch.picks, host(weights.unwrap()))
+        };
+        let ((rows, own), (same_rows, alike)) = (shaped(Mode::Corrected), shaped(Mode::Published));
+        assert_eq!((rows.len(), &rows), (8 + 6, &same_rows));
+        assert!(own[..8].iter().all(|w| *w == 1.0) && own[8..].windows(2).any(|w| w[0] != w[1]), "{own:?}");
+        let mean = own.iter().sum::<f32>() / 14.0;
+        assert!(alike.len() == 14 && alike.iter().all(|w| (w - mean).abs() < 1e-6), "{alike:?} {mean}");
     }
 
     #[test]

@@ -22,6 +22,7 @@ pub mod bc;
 mod blocks;
 pub mod bosa;
 mod buffer;
+mod contexts;
 pub mod critic;
 pub mod cvae;
 pub mod dara;

@@ -6,8 +6,7 @@
 //! L_π = mean over steps and action dimensions of (π_t - a_t)²                → DT
 //! ```
 //!
-//! A member's segments are half from the target, half from the source ([`crate::sequences`]). Steps 0 to `world_model.steps` - 1 of
-//! the training are the world model's, the others the transformer's: [`MetaDt::updates`].
+//! A member's segments are half from the target, half from the source ([`crate::sequences`]).
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -33,17 +32,18 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::tensor::{Int, TensorData};
-use tce_nn::{AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
+use tce_nn::{AdamConfig, Device, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
-use crate::buffer::{Buffer, Minibatch};
+use crate::buffer::{Buffer, Member, Minibatch};
+use crate::contexts::{Contexts, Of};
 use crate::error::{LearnError, within};
 use crate::networks::Dropout;
 use crate::policy::Policy;
 use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
-use crate::sequences::{Segments, Trajectories};
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::sequences::Segments;
+use crate::training::{Learner, Meter, Place, PolicyLearner, prepare};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
-use crate::world_model::{Contexts, Of, SegmentTensors, WorldModel, WorldModelConfig, strip};
+use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
 
 /// The configuration of [`MetaDt`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -136,52 +136,51 @@ impl MetaDtConfig {
 pub struct MetaDt {
     config: MetaDtConfig,
     buffer: Buffer,
-    members: Vec<MemberNets>,
     device: Device,
+    /// Finished.
+    worlds: Worlds,
+    members: Vec<MemberNets>,
 }
 
 struct MemberNets {
     streams: Streams,
-    trajectories: Trajectories,
-    world: Trained<WorldModel>,
     /// Of the finished world model.
     contexts: Contexts,
     transformer: Trained<DecisionTransformer>,
 }
 
 impl MetaDt {
-    /// New networks for the members of `buffer`.
+    /// New networks for the members of `buffer`; the world models are trained here. None if the user interrupted that.
     ///
     /// # Errors
-    /// If the configuration cannot be used.
-    pub fn new(buffer: &Buffer, config: &MetaDtConfig, device: &Device) -> Result<Self, LearnError> {
+    /// If the configuration cannot be used, or a checkpoint at `place` cannot be read or written.
+    pub fn new(
+        buffer: &Buffer,
+        config: &MetaDtConfig,
+        place: Place<'_>,
+        device: &Device,
+    ) -> Result<Option<Self>, LearnError> {
         config.check()?;
+        let c = &config.world_model;
+        let mut worlds = Worlds::new(buffer, c, device);
+        // A batch of nobody's: the world models draw segments.
+        let rows = Buffer::new(buffer.members().to_vec(), 2)?;
+        if !prepare(&mut worlds, &rows, c.steps, "Meta-DT world model", place, device)? {
+            return Ok(None);
+        }
         let trainable = device.clone().autodiff();
-        let (inputs, actions) = (buffer.inputs().len(), buffer.act_dim());
-        let clipped = |max_norm: f64, weight_decay: f64| AdamConfig {
-            max_norm: Some(max_norm),
-            weight_decay,
-            ..AdamConfig::default()
-        };
-        let nets = |member: &crate::buffer::Member| {
-            let world = config.world_model.init(inputs, actions, member.streams, &trainable);
-            let transformer = sizes(config, inputs, actions).init(member.streams, &trainable);
-            let trajectories = Trajectories::new(member);
+        let adam =
+            AdamConfig { max_norm: Some(config.grad_clip), weight_decay: config.weight_decay, ..AdamConfig::default() };
+        let nets = |(m, member): (usize, &Member)| {
+            let transformer = sizes(config, buffer.inputs().len(), buffer.act_dim()).init(member.streams, &trainable);
             MemberNets {
                 streams: member.streams,
-                contexts: Contexts::new(&trajectories, config.world_model.latent),
-                trajectories,
-                world: Trained::with(world, clipped(config.world_model.grad_clip, 0.0)),
-                transformer: Trained::with(transformer, clipped(config.grad_clip, config.weight_decay)),
+                contexts: Contexts::new(worlds.member(m).0, c.latent),
+                transformer: Trained::with(transformer, adam),
             }
         };
-        let members = buffer.members().iter().map(nets).collect();
-        Ok(Self { config: config.clone(), buffer: buffer.clone(), members, device: device.clone() })
-    }
-
-    /// Steps of a training in which the transformer makes `steps`: the world model's come before.
-    pub fn updates(config: &MetaDtConfig, steps: u64) -> u64 {
-        config.world_model.steps + steps
+        let members = buffer.members().iter().enumerate().map(nets).collect();
+        Ok(Some(Self { config: config.clone(), buffer: buffer.clone(), device: device.clone(), worlds, members }))
     }
 }
 
@@ -199,19 +198,9 @@ fn sizes(c: &MetaDtConfig, inputs: usize, actions: usize) -> TransformerSizes {
 }
 
 impl MemberNets {
-    /// A step down L_W; its two terms.
-    fn world_step(&mut self, segments: &Segments, c: &WorldModelConfig, device: &Device) -> [f64; 2] {
-        let batch = SegmentTensors::new(segments, 1, device);
-        let [state, reward] = self.world.net().losses(&batch, strip(segments, c.batch, device));
-        let figures = [&state, &reward].map(|l| host(l.clone())[0] as f64);
-        self.world.step(state + reward, c.lr);
-        figures
-    }
-
     /// π at the steps of `segments`, `[B, K, A]`.
     fn actions(&mut self, segments: &Segments, of: Of, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<3> {
-        let encoder = self.world.net().encoder.valid();
-        let contexts = self.contexts.of(segments, c.context, &encoder, &self.trajectories, of);
+        let contexts = self.contexts.of(segments, c.context, of);
         let batch = SegmentTensors::new(segments, c.context, of.device);
         let shape = [c.batch, c.context];
         let on_device = |v: Vec<f32>| {
@@ -228,61 +217,53 @@ impl MemberNets {
         };
         self.transformer.net().forward(input, dropout)
     }
+}
 
-    /// L_π of `segments`, `[1]`.
-    fn policy_loss(&mut self, segments: &Segments, of: Of, c: &MetaDtConfig, dropout: &mut Dropout) -> Tensor<1> {
-        let actions = self.actions(segments, of, c, dropout);
-        let [b, k, width] = actions.dims();
-        let data = tensor(segments.actions.clone(), [b, k, width], of.device);
-        let valid = tensor(segments.valid.clone(), [b, k, 1], of.device);
-        let numbers = segments.valid.iter().sum::<f32>() * width as f32;
-        ((actions - data).square() * valid).sum() / numbers
-    }
+/// L_π of `actions` `[B, K, A]` at the steps of `segments`, `[1]`.
+fn policy_loss(actions: Tensor<3>, segments: &Segments, device: &Device) -> Tensor<1> {
+    let [b, k, width] = actions.dims();
+    let data = tensor(segments.actions.clone(), [b, k, width], device);
+    let valid = tensor(segments.valid.clone(), [b, k, 1], device);
+    let numbers = segments.valid.iter().sum::<f32>() * width as f32;
+    ((actions - data).square() * valid).sum() / numbers
 }
 
 impl Learner for MetaDt {
     /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
     fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, buffer, members, device } = self;
-        let w = &c.world_model;
-        let mut figures: [Vec<f64>; 2] = Default::default();
+        let Self { config: c, buffer, device, worlds, members } = self;
+        let mut figures = Vec::new();
         for (m, nets) in members.iter_mut().enumerate() {
-            if let Some(step) = step.checked_sub(w.steps) {
-                let segments = nets.trajectories.sample(buffer, m, w.steps + step, [c.batch, c.context, 0]);
-                let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
-                let of = Of { buffer, member: m, device };
-                let loss = nets.policy_loss(&segments, of, c, &mut dropout);
-                figures[0].push(host(loss.clone())[0] as f64);
-                nets.transformer.step(loss, c.rate(step));
-            } else {
-                let segments = nets.trajectories.sample(buffer, m, step, [w.batch, 1, w.horizon]);
-                let [state, reward] = nets.world_step(&segments, w, device);
-                figures[0].push(state);
-                figures[1].push(reward);
+            let (trajectories, encoder) = worlds.member(m);
+            // Other segments than the world model's.
+            let segments = trajectories.sample(buffer, m, c.world_model.steps + step, [c.batch, c.context, 0]);
+            let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
+            let of = Of { trajectories, encoder, buffer, member: m, device };
+            let loss = policy_loss(nets.actions(&segments, of, c, &mut dropout), &segments, device);
+            if meter.active() {
+                figures.push(host(loss.clone())[0] as f64);
             }
+            nets.transformer.step(loss, c.rate(step));
         }
         if meter.active() {
-            let names = if step < w.steps { ["world_state_loss", "world_reward_loss"] } else { ["policy_loss", ""] };
-            for (name, values) in names.into_iter().zip(figures).filter(|(name, _)| !name.is_empty()) {
-                meter.add(name, values);
-            }
+            meter.add("policy_loss", figures);
         }
     }
 
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
+        self.worlds.save(&mut state);
         for (m, nets) in self.members.iter().enumerate() {
-            nets.world.save(&format!("world.{m}"), &mut state);
             nets.transformer.save(&format!("transformer.{m}"), &mut state);
         }
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.worlds.load(state, path)?;
         for (m, nets) in self.members.iter_mut().enumerate() {
-            nets.world.load(&format!("world.{m}"), state, path)?;
             nets.transformer.load(&format!("transformer.{m}"), state, path)?;
-            nets.contexts = Contexts::new(&nets.trajectories, self.config.world_model.latent);
+            nets.contexts = Contexts::new(self.worlds.member(m).0, self.config.world_model.latent);
         }
         Ok(())
     }
@@ -292,7 +273,8 @@ impl PolicyLearner for MetaDt {
     fn policies(&self) -> Vec<Policy> {
         let (buffer, c) = (&self.buffer, &self.config);
         let (inputs, actions) = (buffer.inputs().len(), buffer.act_dim());
-        let policy = |(nets, member): (&MemberNets, &crate::buffer::Member)| {
+        let policy = |(m, (nets, member)): (usize, (&MemberNets, &Member))| {
+            let (trajectories, encoder) = self.worlds.member(m);
             let spec = SequenceSpec {
                 observations: buffer.obs_dim(),
                 actions,
@@ -302,12 +284,12 @@ impl PolicyLearner for MetaDt {
                 encoder: c.world_model.sizes(inputs, actions),
                 transformer: sizes(c, inputs, actions),
                 return_scale: c.return_scale,
-                first_return: c.return_factor * nets.trajectories.best_target_return(),
+                first_return: c.return_factor * trajectories.best_target_return(),
             };
-            let policy = SequencePolicy::of(spec, &nets.world.net().encoder, nets.transformer.net());
+            let policy = SequencePolicy::of(spec, encoder, nets.transformer.net());
             Policy::Sequence(Box::new(policy))
         };
-        self.members.iter().zip(buffer.members()).map(policy).collect()
+        self.members.iter().zip(buffer.members()).enumerate().map(policy).collect()
     }
 }
 
@@ -330,7 +312,7 @@ mod tests {
         }
         let t = Arc::new(t);
         let standardizer = Standardizer::fit(&t.observations, 3);
-        let member = crate::Member {
+        let member = Member {
             streams: Streams::new(1),
             parts: vec![t.clone()],
             standardizer,
@@ -340,8 +322,8 @@ mod tests {
         let buffer = Buffer::new(vec![member], 2).unwrap();
         let mut config = MetaDtConfig { context: 3, embed: 16, heads: 2, batch: 5, ..MetaDtConfig::default() };
         (config.timesteps, config.return_scale) = (4, 2.0);
-        (config.world_model.horizon, config.world_model.gru) = (2, 8);
-        (MetaDt::new(&buffer, &config, &cpu()).unwrap(), t)
+        (config.world_model.horizon, config.world_model.gru, config.world_model.steps) = (2, 8, 0);
+        (MetaDt::new(&buffer, &config, Place::NONE, &cpu()).unwrap().unwrap(), t)
     }
 
     /// The loss of a batch, from the actions of the finished policy as it is led through the table's episodes step by step: what
@@ -364,11 +346,13 @@ mod tests {
                 memory.reward(t.rewards[i].into());
             }
         }
-        let MetaDt { config: c, buffer, members, device } = &mut learner;
+        let MetaDt { config: c, buffer, device, worlds, members } = &mut learner;
         let nets = &mut members[0];
-        let segments = nets.trajectories.sample(buffer, 0, 11, [c.batch, c.context, 0]);
-        let of = Of { buffer, member: 0, device };
-        let loss = host(nets.policy_loss(&segments, of, c, &mut Dropout::none()))[0];
+        let (trajectories, encoder) = worlds.member(0);
+        let segments = trajectories.sample(buffer, 0, 11, [c.batch, c.context, 0]);
+        let of = Of { trajectories, encoder, buffer, member: 0, device };
+        let actions = nets.actions(&segments, of, c, &mut Dropout::none());
+        let loss = host(policy_loss(actions.clone(), &segments, device))[0];
         let begin = |row: usize| [0, 7, 8].into_iter().rfind(|b| *b <= row).unwrap();
         let rows = segments.picks.iter().flat_map(|p| {
             let row = p.row as usize;
@@ -378,7 +362,7 @@ mod tests {
         // The policy sees three steps, a segment's later steps as well; a segment that begins within an episode sees fewer.
         let whole: Vec<_> = segments.picks.iter().map(|p| p.row as usize).collect();
         assert!(rows.len() > whole.len());
-        let per_step = host(nets.actions(&segments, of, c, &mut Dropout::none()));
+        let per_step = host(actions);
         for (k, row) in whole.into_iter().enumerate() {
             let last = segments.valid[3 * k..][..3].iter().filter(|v| **v > 0.0).count() - 1;
             let own = &per_step[(3 * k + last) * 2..][..2];

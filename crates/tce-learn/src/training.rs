@@ -12,8 +12,9 @@ use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
 use crate::policy::Policy;
 
-/// Losses and other figures are taken every so many steps: they cost time, and their means need no more.
-const METER_EVERY: u64 = 10;
+/// Losses and other figures are taken every so many steps: they cost time, and their means need no more. A prime, because what a
+/// method does at every second step is to be seen too.
+const METER_EVERY: u64 = 11;
 /// Steps of a lane before the next one's turn.
 const TURN: u64 = 50;
 

@@ -9,19 +9,19 @@
 //!
 //! z_t is made of what lies before t, so that it is known when a_t is chosen. Steps before an episode's beginning are zeros.
 
-use std::collections::BTreeSet;
+use std::path::Path;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::nn::{Initializer, Linear, LinearConfig, gru::Gru, gru::GruConfig};
 use tce_nn::burn::tensor::activation::relu;
-use tce_nn::{Device, Module, Tensor, host, tensor};
+use tce_nn::{AdamConfig, Device, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
-use crate::buffer::{Buffer, Pick};
+use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::networks::{Start, initialise};
 use crate::sequences::{Segments, Trajectories};
+use crate::training::{Learner, Meter};
 
 /// The sizes of a [`ContextEncoder`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -81,7 +81,8 @@ pub struct ContextEncoder {
     reward: Linear,
     gru: Gru,
     latent: Linear,
-    horizon: usize,
+    /// h
+    pub(crate) horizon: usize,
 }
 
 impl ContextEncoder {
@@ -132,7 +133,7 @@ impl WorldModel {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldModelConfig {
-    /// Training steps, before the first of the transformer's.
+    /// Training steps, before the transformer's.
     pub steps: u64,
     /// Learning rate, constant.
     pub lr: f64,
@@ -247,79 +248,78 @@ pub fn strip(segments: &Segments, batch: usize, device: &Device) -> [Tensor<3>; 
         .map(|v| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device))
 }
 
-/// Whose rows are meant, and where they are computed with.
-#[derive(Clone, Copy)]
-pub(crate) struct Of<'a> {
-    pub buffer: &'a Buffer,
-    pub member: usize,
-    pub device: &'a Device,
+/// The world models of a population while they are trained; a member's networks are modules of their own.
+pub struct Worlds {
+    config: WorldModelConfig,
+    buffer: Buffer,
+    device: Device,
+    members: Vec<(Trajectories, Trained<WorldModel>)>,
 }
 
-/// z of the rows of a member's tables, under a world model that does not change any more: each is needed again and again.
-///
-/// They are computed when first asked for, in blocks that are always the same, so that a training that was resumed gets the
-/// same bits: a product of matrices may round a row differently among other rows.
-#[derive(Clone, Debug)]
-pub(crate) struct Contexts {
-    latent: usize,
-    tables: Vec<TableContexts>,
-}
-
-#[derive(Clone, Debug)]
-struct TableContexts {
-    values: Vec<f32>,
-    /// Whether a block has been computed.
-    known: Vec<bool>,
-}
-
-/// Rows of a block: few, because the segments of a training's first steps touch as many blocks as they have rows.
-const BLOCK: usize = 64;
-
-impl Contexts {
-    /// None known yet.
-    pub(crate) fn new(trajectories: &Trajectories, latent: usize) -> Self {
-        let table =
-            |rows: usize| TableContexts { values: vec![0.0; rows * latent], known: vec![false; rows.div_ceil(BLOCK)] };
-        Self { latent, tables: trajectories.rows().map(table).collect() }
+impl Worlds {
+    /// New networks for the members of `buffer`.
+    pub fn new(buffer: &Buffer, config: &WorldModelConfig, device: &Device) -> Self {
+        let trainable = device.clone().autodiff();
+        let adam = AdamConfig { max_norm: Some(config.grad_clip), ..AdamConfig::default() };
+        let start = |member: &Member| {
+            let model = config.init(buffer.inputs().len(), buffer.act_dim(), member.streams, &trainable);
+            (Trajectories::new(member), Trained::with(model, adam))
+        };
+        let members = buffer.members().iter().map(start).collect();
+        Self { config: config.clone(), buffer: buffer.clone(), device: device.clone(), members }
     }
 
-    /// z of the steps of `segments`, `[B, K, Z]` row-major; behind the last step zeros.
-    pub(crate) fn of(
-        &mut self,
-        segments: &Segments,
-        steps: usize,
-        encoder: &ContextEncoder,
-        trajectories: &Trajectories,
-        Of { buffer, member, device }: Of,
-    ) -> Vec<f32> {
-        let rows = |(pick, valid): (&Pick, &[f32])| {
-            let length = valid.iter().filter(|v| **v > 0.0).count();
-            (pick.part as usize, pick.row as usize + 1 - length..pick.row as usize + 1)
-        };
-        let rows: Vec<_> = segments.picks.iter().zip(segments.valid.chunks_exact(steps)).map(rows).collect();
-        let blocks = rows.iter().flat_map(|(part, r)| (r.start / BLOCK..=(r.end - 1) / BLOCK).map(|b| (*part, b)));
-        let missing: BTreeSet<_> = blocks.filter(|&(part, b)| !self.tables[part].known[b]).collect();
-        let computed: Vec<_> = missing
-            .into_par_iter()
-            .map(|(part, block)| {
-                let end = self.tables[part].values.len() / self.latent;
-                let range = block * BLOCK..end.min((block + 1) * BLOCK);
-                let size = range.len();
-                let segments = trajectories.block(buffer, member, part, range, encoder.horizon);
-                (part, block, host(encoder.contexts(strip(&segments, size, device))))
-            })
-            .collect();
-        for (part, block, values) in computed {
-            let table = &mut self.tables[part];
-            table.values[block * BLOCK * self.latent..][..values.len()].copy_from_slice(&values);
-            table.known[block] = true;
+    /// The trajectories of member `m`, and the encoder as it is now.
+    pub fn member(&self, m: usize) -> (&Trajectories, &ContextEncoder) {
+        let (trajectories, model) = &self.members[m];
+        (trajectories, &model.net().encoder)
+    }
+
+    /// Adds the networks to `state`.
+    pub fn save(&self, state: &mut NamedParameters) {
+        for (m, (_, model)) in self.members.iter().enumerate() {
+            model.save(&format!("world.{m}"), state);
         }
-        let mut out = Vec::with_capacity(rows.len() * steps * self.latent);
-        for (k, (part, rows)) in rows.into_iter().enumerate() {
-            out.extend_from_slice(&self.tables[part].values[rows.start * self.latent..rows.end * self.latent]);
-            out.resize((k + 1) * steps * self.latent, 0.0);
+    }
+
+    /// Takes them from `state`; `path` is where it came from, for messages.
+    ///
+    /// # Errors
+    /// If they belong to other networks.
+    pub fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        let mut members = self.members.iter_mut().enumerate();
+        members.try_for_each(|(m, (_, model))| model.load(&format!("world.{m}"), state, path))
+    }
+}
+
+impl Learner for Worlds {
+    /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
+    fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
+        let Self { config: c, buffer, device, members } = self;
+        let mut figures: [Vec<f64>; 2] = Default::default();
+        for (m, (trajectories, model)) in members.iter_mut().enumerate() {
+            let segments = trajectories.sample(buffer, m, step, [c.batch, 1, c.horizon]);
+            let batch = SegmentTensors::new(&segments, 1, device);
+            let losses = model.net().losses(&batch, strip(&segments, c.batch, device));
+            if meter.active() {
+                figures.iter_mut().zip(&losses).for_each(|(f, loss)| f.push(host(loss.clone())[0] as f64));
+            }
+            let [state, reward] = losses;
+            model.step(state + reward, c.lr);
         }
-        out
+        if meter.active() {
+            ["world_state_loss", "world_reward_loss"].iter().zip(figures).for_each(|(name, f)| meter.add(name, f));
+        }
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        self.save(&mut state);
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.load(state, path)
     }
 }
 

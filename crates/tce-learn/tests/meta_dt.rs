@@ -9,8 +9,8 @@ use common::go;
 use rand::RngExt;
 use tce_base::{Streams, random::fill_normal};
 use tce_data::{Standardizer, Transitions};
-use tce_learn::world_model::WorldModelConfig;
-use tce_learn::{Buffer, Learner, Member, MetaDt, MetaDtConfig, Meter, Policy, PolicyLearner};
+use tce_learn::world_model::{WorldModelConfig, Worlds};
+use tce_learn::{Buffer, Learner, Member, MetaDt, MetaDtConfig, Meter, Place, Policy, PolicyLearner};
 use tce_nn::{NamedParameters, cpu};
 
 /// A corridor: s = position, a moves it by a/5, the reward is the new position. An episode goes all the way left or all the
@@ -63,6 +63,11 @@ fn small(world_steps: u64) -> MetaDtConfig {
     }
 }
 
+/// With a world model that has been trained.
+fn prepared(buffer: &Buffer, config: &MetaDtConfig) -> MetaDt {
+    MetaDt::new(buffer, config, Place::NONE, &cpu()).unwrap().expect("not interrupted")
+}
+
 /// Return of an episode from 0.
 fn rollout(policy: &Policy) -> f32 {
     let (mut memory, mut x, mut sum, mut a) = ([policy.start()], 0.0f32, 0.0, [0.0]);
@@ -80,38 +85,47 @@ fn rollout(policy: &Policy) -> f32 {
 fn it_does_what_the_return_it_is_asked_for_says() {
     let buffer = Buffer::new(vec![two_parts(1)], 2).unwrap();
     let config = small(150);
-    let mut learner = MetaDt::new(&buffer, &config, &cpu()).unwrap();
-    go(&mut learner, &buffer, 0, 120);
-    let world = go(&mut learner, &buffer, 120, 150);
+    let mut worlds = Worlds::new(&buffer, &config.world_model, &cpu());
+    go(&mut worlds, &buffer, 0, 120);
+    let world = go(&mut worlds, &buffer, 120, 150);
     assert!(world.metrics["world_state_loss"][0] < 0.1, "{world:?}");
-    let report = go(&mut learner, &buffer, 150, MetaDt::updates(&config, 500));
+    let mut learner = prepared(&buffer, &config);
+    let (trained, state) = (worlds.state(), learner.state());
+    assert!(trained.tensors.iter().all(|(name, t)| state.tensors[name] == *t), "another world model was prepared");
+    let report = go(&mut learner, &buffer, 0, 500);
     assert!(report.metrics["policy_loss"][0].is_finite());
     // An action of 1 all the time earns 12.
     let best = rollout(&learner.policies()[0]);
     assert!(best > 9.0, "{best}");
     let worst = MetaDtConfig { return_factor: -1.0, ..config };
-    let mut other = MetaDt::new(&buffer, &worst, &cpu()).unwrap();
+    let mut other = prepared(&buffer, &worst);
     other.restore(&learner.state(), Path::new("state")).unwrap();
     let worst = rollout(&other.policies()[0]);
     assert!(worst < -9.0, "{worst}");
 }
 
-/// Stopped within either part of the training, or between them.
-#[test]
-fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
-    let buffer = Buffer::new(vec![two_parts(1), two_parts(2)], 2).unwrap();
-    let new = || MetaDt::new(&buffer, &small(5), &cpu()).unwrap();
+/// A training of 7 steps, stopped within.
+fn resumed<L: Learner>(buffer: &Buffer, new: impl Fn() -> L) -> L {
     let mut whole = new();
-    go(&mut whole, &buffer, 0, 12);
-    for stop in [3, 5, 9] {
+    go(&mut whole, buffer, 0, 7);
+    for stop in [1, 4] {
         let mut first = new();
-        go(&mut first, &buffer, 0, stop);
+        go(&mut first, buffer, 0, stop);
         let state = NamedParameters::from_bytes(&first.state().to_bytes(), Path::new("state")).unwrap();
         let mut second = new();
         second.restore(&state, Path::new("state")).unwrap();
-        go(&mut second, &buffer, stop, 12);
+        go(&mut second, buffer, stop, 7);
         assert!(whole.state().to_bytes() == second.state().to_bytes(), "stopped at {stop}");
     }
+    whole
+}
+
+#[test]
+fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
+    let buffer = Buffer::new(vec![two_parts(1), two_parts(2)], 2).unwrap();
+    resumed(&buffer, || Worlds::new(&buffer, &small(5).world_model, &cpu()));
+    let new = || prepared(&buffer, &small(5));
+    let whole = resumed(&buffer, new);
     let error = new().restore(&whole.policies()[0].to_parameters(), Path::new("other.safetensors")).unwrap_err();
     assert!(error.to_string().contains("other.safetensors"), "{error}");
 }
@@ -120,8 +134,8 @@ fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
 fn a_member_equals_a_run_of_its_own() {
     let learn = |members: Vec<Member>| {
         let buffer = Buffer::new(members, 2).unwrap();
-        let mut learner = MetaDt::new(&buffer, &small(3), &cpu()).unwrap();
-        go(&mut learner, &buffer, 0, 6);
+        let mut learner = prepared(&buffer, &small(3));
+        go(&mut learner, &buffer, 0, 3);
         learner.policies().pop().unwrap().to_parameters()
     };
     assert_eq!(learn(vec![two_parts(1), two_parts(2)]), learn(vec![two_parts(2)]));
@@ -136,8 +150,8 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
             let buffer = Buffer::new(vec![two_parts(1)], 2).unwrap();
             let mut config = MetaDtConfig::default();
             config.world_model.steps = 2;
-            let mut learner = MetaDt::new(&buffer, &config, &cpu()).unwrap();
-            go(&mut learner, &buffer, 0, 4);
+            let mut learner = prepared(&buffer, &config);
+            go(&mut learner, &buffer, 0, 2);
             let policy = learner.policies().remove(0);
             (learner.state().to_bytes(), policy.to_parameters().to_bytes(), rollout(&policy))
         })
@@ -154,8 +168,8 @@ fn generated_rows_are_learned_from_too() {
         t.push(&[x], &[-0.5 * x], 1.0, &[x], false, true);
     }
     let buffer = Buffer::new(vec![member(3, vec![Arc::new(t)])], 2).unwrap();
-    let mut learner = MetaDt::new(&buffer, &small(5), &cpu()).unwrap();
-    let report = go(&mut learner, &buffer, 0, 305);
+    let mut learner = prepared(&buffer, &small(5));
+    let report = go(&mut learner, &buffer, 0, 300);
     let mut a = [0.0; 2];
     learner.policies()[0].act(&[0.8, -0.4], None, &mut a);
     assert!((a[0] + 0.4).abs() < 0.15 && (a[1] - 0.2).abs() < 0.15, "{a:?} {report:?}");
@@ -166,7 +180,7 @@ fn files_keep_every_bit_and_other_files_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("policy.safetensors");
     let buffer = Buffer::new(vec![two_parts(1)], 2).unwrap();
-    let learner = MetaDt::new(&buffer, &small(1), &cpu()).unwrap();
+    let learner = prepared(&buffer, &small(1));
     let policy = learner.policies().remove(0);
     policy.save(&path).unwrap();
     let loaded = Policy::load(&path).unwrap();
@@ -205,7 +219,7 @@ fn bad_configurations_are_refused() {
     let set = |change: fn(&mut MetaDtConfig)| {
         let mut config = small(1);
         change(&mut config);
-        MetaDt::new(&buffer, &config, &cpu()).err().expect("refused").to_string()
+        MetaDt::new(&buffer, &config, Place::NONE, &cpu()).err().expect("refused").to_string()
     };
     assert!(set(|c| c.heads = 3).contains("heads: found 3, expected a divisor of embed = 32"));
     assert!(set(|c| c.context = 0).contains("context"));
@@ -234,23 +248,23 @@ fn speed() {
     let t = Arc::new(t);
     let buffer = Buffer::new(vec![member(0, vec![t.clone(), t])], 256).unwrap();
     let mut config = MetaDtConfig::default();
-    config.world_model.steps = 60;
+    config.world_model.steps = 0;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     pool.install(|| {
-        let mut learner = MetaDt::new(&buffer, &config, &cpu()).unwrap();
         let batch = buffer.sample(0, &cpu());
-        let mut meter = Meter::always();
-        for (name, from, to) in [("world model", 10, 60), ("contexts", 60, 61), ("transformer", 65, 95)] {
-            (from - 5..from).filter(|_| name != "contexts").for_each(|step| learner.update(&batch, step, &mut meter));
+        let time = |name: &str, learner: &mut dyn Learner, warm: u64, steps: u64| {
+            let mut meter = Meter::always();
+            (0..warm).for_each(|step| learner.update(&batch, step, &mut meter));
             let (started, before) = (std::time::Instant::now(), used());
-            (from..to).for_each(|step| learner.update(&batch, step, &mut meter));
-            let per_second = |seconds: f64| (to - from) as f64 / seconds;
+            (warm..warm + steps).for_each(|step| learner.update(&batch, step, &mut meter));
             let (clock, core) = (started.elapsed().as_secs_f64(), (used() - before) * 1e-9);
-            println!(
-                "{name}: {:.1} updates per second of a core, {:.1} of the clock",
-                per_second(core),
-                per_second(clock)
-            );
-        }
+            let [core, clock] = [core, clock].map(|seconds| steps as f64 / seconds);
+            println!("{name}: {core:.1} updates per second of a core, {clock:.1} of the clock");
+        };
+        time("world model", &mut Worlds::new(&buffer, &config.world_model, &cpu()), 5, 50);
+        let mut learner = prepared(&buffer, &config);
+        // The first step computes most contexts.
+        time("contexts", &mut learner, 0, 1);
+        time("transformer", &mut learner, 5, 30);
     });
 }

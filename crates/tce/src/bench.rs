@@ -18,6 +18,7 @@ use tce_diffusion::{
 };
 use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
 use tce_learn::sac::{Sac, SacConfig};
+use tce_learn::world_model::Worlds;
 use tce_learn::{
     Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
     MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
@@ -70,8 +71,8 @@ const WORKLOADS: &[Workload] = &[
     ("rebrac", "ReBRAC", || method(Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
-    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", || meta_dt(0)),
-    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", || meta_dt(1 << 40)),
+    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", || meta_dt(false)),
+    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", || meta_dt(true)),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
     ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", || score_eval(1024)),
     ("score-eval-4k", "the same, 4 096 rows", || score_eval(4096)),
@@ -265,15 +266,18 @@ fn bc() -> Body {
     learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
 }
 
-/// The world model's updates for `world` steps, then the transformer's.
-fn meta_dt(world: u64) -> Body {
+/// The transformer's updates, or those of its `world` model.
+fn meta_dt(world: bool) -> Body {
     let mut c = MetaDtConfig::default();
-    c.world_model.steps = world;
+    c.world_model.steps = 0;
     // Few rows: their contexts, which a training computes once, are all there after the warm-up.
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(BATCH).expect("target rows");
-    let learner = MetaDt::new(&buffer, &c, &cpu()).expect("defaults");
+    let learner: Box<dyn Learner> = match world {
+        true => Box::new(Worlds::new(&buffer, &c.world_model, &cpu())),
+        false => Box::new(MetaDt::new(&buffer, &c, Place::NONE, &cpu()).expect("defaults").expect("not interrupted")),
+    };
     let (w, square) = (&c.world_model, (c.embed * c.embed) as f64);
-    let products = if world > 0 {
+    let products = if world {
         let step = (OBS + ACT + 1) * w.features + 3 * w.gru * (3 * w.features + w.gru);
         let decoder = |out: usize| row_products(&[OBS + ACT + w.latent, w.hidden[0], w.hidden[1], out]).0;
         (w.horizon * step + w.gru * w.latent) as f64 + decoder(OBS) + decoder(1)
@@ -286,7 +290,7 @@ fn meta_dt(world: u64) -> Body {
         let step = OBS * w.features + (1 + w.features + w.latent + 2 * ACT) * c.embed;
         blocks + last + states * step as f64
     };
-    learning(vec![(buffer, Box::new(learner))], 2.0 * c.batch as f64 * 3.0 * products)
+    learning(vec![(buffer, learner)], 2.0 * c.batch as f64 * 3.0 * products)
 }
 
 fn cvae() -> Body {

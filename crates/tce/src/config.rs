@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDt, MetaDtConfig,
-    Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDtConfig, Mode,
+    OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -258,14 +258,6 @@ impl LearnerConfig {
             Algorithm::Otdf => Some(self.otdf.backbone(&self.iql)),
             Algorithm::Dmc => Some(self.dmc.backbone(&self.iql)),
             Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa | Algorithm::MetaDt => None,
-        }
-    }
-
-    /// Steps of the whole training: `steps` of the policy, and before them those of a model that it needs.
-    pub fn updates(&self) -> u64 {
-        match self.algorithm {
-            Algorithm::MetaDt => MetaDt::updates(&self.meta_dt, self.steps),
-            _ => self.steps,
         }
     }
 

@@ -15,7 +15,7 @@ use rand::RngExt;
 use tce_base::{Rng, Streams, write_sealed};
 use tce_data::{LoadOptions, Standardizer, Transitions, load};
 use tce_diffusion::ScoreModel;
-use tce_learn::{Buffer, Member, MetaDt, MetaDtConfig, Policy, PolicyLearner, import::load_npz};
+use tce_learn::{Buffer, Member, MetaDt, MetaDtConfig, Place, Policy, PolicyLearner, import::load_npz};
 use tce_nn::{Checkpoints, NamedParameters, cpu};
 
 use crate::layers::{Layered, Preset};
@@ -170,7 +170,9 @@ fn sequence_policy() -> Vec<u8> {
     let buffer = Buffer::new(vec![member], 1).unwrap();
     let mut config = MetaDtConfig { embed: 2, layers: 1, timesteps: 2, ..MetaDtConfig::default() };
     (config.world_model.features, config.world_model.gru, config.world_model.latent) = (1, 1, 1);
-    MetaDt::new(&buffer, &config, &cpu()).unwrap().policies()[0].to_parameters().to_bytes()
+    config.world_model.steps = 0;
+    let learner = MetaDt::new(&buffer, &config, Place::NONE, &cpu()).unwrap().unwrap();
+    learner.policies()[0].to_parameters().to_bytes()
 }
 
 #[test]

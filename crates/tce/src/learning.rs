@@ -77,7 +77,7 @@ pub fn learn(
     let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
     let mut lanes: Vec<_> =
         learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
-    let updates = config.updates();
+    let updates = config.steps;
     let steps = Steps::new(updates, (updates / 50).max(1));
     let label = format!("learn {} {seeds:?}", config.algorithm.method().name);
     let mut learned = Learned::default();

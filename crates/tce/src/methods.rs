@@ -102,7 +102,9 @@ impl Algorithm {
                 "igdf",
                 "IQL; source rows chosen by a contrastive model of the target's dynamics",
                 "Wen et al. 2024; ODRL",
-                Some("the contrastive model is never trained"),
+                Some(
+                    "the contrastive model is never trained; with code = \"authors\", no row weighs more than another",
+                ),
                 "igdf",
                 source,
             ),
@@ -164,7 +166,7 @@ pub fn build(
         }
         Algorithm::Otdf => Box::new(Otdf::new(buffer, &config.otdf, iql, regulariser()?, steps, device)?),
         Algorithm::Dmc => Box::new(Dmc::new(buffer, &config.dmc, iql, regulariser()?, steps, device)?),
-        Algorithm::MetaDt => Box::new(MetaDt::new(buffer, &config.meta_dt, device)?),
+        Algorithm::MetaDt => Box::new(MetaDt::new(buffer, &config.meta_dt, place, device)?.ok_or(Error::Interrupted)?),
         Algorithm::Bosa => Box::new(Bosa::new(buffer, &config.bosa, steps, place, device)?.ok_or(Error::Interrupted)?),
     })
 }

@@ -13,6 +13,7 @@ use tce_diagnosis::Diagnosis;
 use tce_report::folder::Verdict;
 use tce_report::{Cost, Method, Missing, ReportError, Run, RunFolder, Study};
 
+use crate::config::Config;
 use crate::diagnosis;
 use crate::error::{Error, Result};
 use crate::sweep::gather::Checked;
@@ -27,11 +28,13 @@ pub fn of_directory(directory: &Path) -> Result<Study> {
     if directory.join("manifest.jsonl").exists() { of_sweep(&Sweep::open(directory)?) } else { of_runs(directory) }
 }
 
-fn method(variant: Variant, label: &str) -> Method {
+/// A column; `config` is that of one of its runs, the variant's own without.
+fn method(variant: Variant, label: &str, config: Option<&Config>) -> Method {
     let floor = Variant::FLOORS.contains(&variant);
+    let title = config.map_or_else(|| variant.own_title(), |c| variant.row_title(c));
     let (id, title) = match label {
-        "" => (variant.name(), variant.own_title()),
-        label => (format!("{variant} {label}"), format!("{}, {label}", variant.own_title())),
+        "" => (variant.name(), title),
+        label => (format!("{variant} {label}"), format!("{title}, {label}")),
     };
     Method { id, title, variant: variant.name(), floor, plain: label.is_empty() }
 }
@@ -40,7 +43,7 @@ fn method(variant: Variant, label: &str) -> Method {
 fn in_order(mut methods: Vec<Method>) -> Vec<Method> {
     for floor in Variant::FLOORS {
         if !methods.iter().any(|m| m.variant == floor.name()) {
-            methods.push(method(floor, ""));
+            methods.push(method(floor, "", None));
         }
     }
     let place = |m: &Method| Variant::FLOORS.iter().position(|f| f.name() == m.variant).unwrap_or(usize::MAX);
@@ -53,7 +56,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     let mut methods: Vec<Method> = Vec::new();
     for (variant, entry) in runs().filter_map(|e| Some((e.variant?, e))) {
         if !methods.iter().any(|m| m.id == entry.column()) {
-            methods.push(method(variant, &entry.label));
+            methods.push(method(variant, &entry.label, Some(&sweep.manifest.config(entry)?)));
         }
     }
     let mut notes = Vec::new();
@@ -222,8 +225,11 @@ fn of_runs(directory: &Path) -> Result<Study> {
             continue;
         }
         let label = id.strip_prefix(name.as_str()).unwrap_or_default().trim();
+        let folder = finished.iter().zip(&ids).find(|(_, of)| *of == id).map(|((_, _, folder), _)| folder);
+        // Another version's configuration may have other keys; its runs are no worse for it.
+        let config = folder.and_then(|f| toml::from_str(&f.config).ok());
         methods.push(match Variant::from_str(name, false) {
-            Ok(variant) => Method { id: id.clone(), ..method(variant, label) },
+            Ok(variant) => Method { id: id.clone(), ..method(variant, label, config.as_ref()) },
             // A name of the user's own.
             Err(_) => Method { id: id.clone(), title: id.clone(), variant: name.clone(), floor: false, plain: false },
         });
@@ -339,9 +345,22 @@ mod tests {
     }
 
     #[test]
+    fn a_column_is_called_what_its_runs_are() {
+        let mut config = Variant::TceOg.own();
+        config.learner.algorithm = crate::config::Algorithm::Td3Bc;
+        assert_eq!(method(Variant::TceOg, "", Some(&config)).title, "TCE(OG), td3-bc");
+        assert_eq!(method(Variant::TceOg, "y0.1", None).title, "TCE(OG), y0.1");
+        assert_eq!(method(Variant::DmcPublished, "", None).title, "DmC (published)");
+    }
+
+    #[test]
     fn all_floors_come_first() {
-        let methods =
-            in_order(vec![method(Variant::TceOg, ""), method(Variant::Bc, "y0.1"), method(Variant::BcRaw, "")]);
+        let methods = in_order(
+            vec![(Variant::TceOg, ""), (Variant::Bc, "y0.1"), (Variant::BcRaw, "")]
+                .into_iter()
+                .map(|(v, l)| method(v, l, None))
+                .collect(),
+        );
         let ids: Vec<&str> = methods.iter().map(|m| m.id.as_str()).collect();
         assert_eq!(ids, ["bc-raw", "bc y0.1", "bc-top", "target-only", "tce-og"]);
     }

@@ -109,18 +109,21 @@ impl Variant {
         }
     }
 
+    /// The variant's own configuration.
+    pub(crate) fn own(self) -> Config {
+        Layered::new(Preset::Default, None, Some(self), None, &[]).and_then(|l| l.config()).expect("tested for all")
+    }
+
     /// The name in tables of a row whose configuration is the variant's own.
     pub fn own_title(self) -> String {
-        let published = if self.name().ends_with("-published") { " (published)" } else { "" };
-        format!("{}{published}", self.title())
+        self.row_title(&self.own())
     }
 
     /// The name in tables of a row that `config` decides: its learner, if that is not the variant's own, and its mode.
     pub fn row_title(self, config: &Config) -> String {
-        let own = Layered::new(Preset::Default, None, Some(self), None, &[]).and_then(|l| l.config());
         let algorithm = config.learner.algorithm;
         let mut title = self.title().to_owned();
-        if own.is_ok_and(|own| own.learner.algorithm != algorithm) {
+        if self.own().learner.algorithm != algorithm {
             title += &format!(", {}", algorithm.method().name);
         }
         if config.learner.mode() == Some(Mode::Published) {

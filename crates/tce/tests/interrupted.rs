@@ -152,16 +152,20 @@ fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
     eprintln!("{ends} runs came to their end");
 }
 
-/// What BOSA and IGDF train before their first step is gone on with too.
+/// What BOSA, IGDF and Meta-DT train before their first step is gone on with too.
 #[test]
 fn rivals_killed_anywhere_learn_the_same() {
     let dir = tempfile::tempdir().unwrap();
-    let task = ["run", "hopper-morph:medium->expert", "--variant", "bosa,igdf,otdf", "--no-floors", "--out", "runs"];
+    let task =
+        ["run", "hopper-morph:medium->expert", "--variant", "bosa,igdf,otdf,meta-dt", "--no-floors", "--out", "runs"];
     let own = [
         "--set=learner.bosa.cvae.steps=150",
         "--set=learner.bosa.cvae.hidden=[16]",
         "--set=learner.bosa.cvae.batch=32",
         "--set=learner.igdf.steps=200",
+        "--set=learner.meta_dt.world_model.steps=60",
+        "--set=learner.meta_dt.embed=16",
+        "--set=learner.meta_dt.batch=16",
         "--set=learner.steps=100",
     ];
     kill_loop(dir.path(), &[&task[..], SMALL, &own].concat(), "runs", kills(8), 3);

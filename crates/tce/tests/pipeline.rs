@@ -301,7 +301,7 @@ fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
     };
     let learned = learn("one", "1");
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
-    assert!(learned["figures"]["world_state_loss"][0].is_number() && learned["figures"]["policy_loss"][1].is_number());
+    assert!(learned["figures"]["policy_loss"][1].is_number());
     assert_eq!(learn("two", "2")["evaluations"], learned["evaluations"]);
     let files = ["one", "two"].map(|o| fs::read(dir.path().join(o).join("policy-seed1.safetensors")).unwrap());
     assert!(files[0] == files[1], "another number of threads gave another policy");
