@@ -125,7 +125,8 @@ pub(crate) fn affine(layer: &Linear, x: Tensor<3>, act: Activation) -> Tensor<3>
 
 /// The normalisation of `x` over its last axis.
 pub(crate) fn normalise(norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-    layer_norm(x, norm.gamma.val(), norm.beta.as_ref().expect("every normalisation here has one").val())
+    let [gamma, beta] = [&norm.gamma, norm.beta.as_ref().expect("every normalisation here has one")];
+    layer_norm(x, gamma.val().reshape([1, 1, -1]), beta.val().reshape([1, 1, -1]))
 }
 
 /// The two layers with a ReLU in between.

@@ -6,6 +6,7 @@ use tce_base::{Streams, random::fill_uniform};
 
 use crate::activation::Activation;
 use crate::dense::dense;
+use crate::norm::layer_norm;
 use crate::tensors::tensor;
 
 /// act(x W + b). PyTorch's default initialisation: W and b from U(±1/√fan_in).
@@ -82,9 +83,7 @@ impl LayerNorm {
 
     /// `[P, B, D]` → `[P, B, D]`.
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let centred = x.clone() - x.mean_dim(2);
-        let variance = centred.clone().square().mean_dim(2);
-        centred / (variance + 1e-5).sqrt() * self.scale.val() + self.shift.val()
+        layer_norm(x, self.scale.val(), self.shift.val())
     }
 }
 

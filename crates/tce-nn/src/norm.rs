@@ -4,7 +4,7 @@
 //! | symbol | shape | meaning |
 //! |---|---|---|
 //! | x, y | `[A, B, D]` | rows of D numbers |
-//! | γ, β | `[D]` | scale and shift, shared by all rows |
+//! | γ, β | `[A, 1, D]` or `[1, 1, D]` | scale and shift, of each of A networks or of all rows |
 //! | ε | - | 1e-5 |
 //!
 //! With x̂ = (x - mean) / σ and g = dy · γ: dx = (g - mean(g) - x̂ mean(g x̂)) / σ, dγ = Σ dy x̂, dβ = Σ dy.
@@ -14,7 +14,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, backend_extension};
-use burn::tensor::{Tensor, TensorData, module};
+use burn::tensor::{Tensor, TensorData};
 use burn_flex::FlexTensor;
 use multiversion::multiversion;
 
@@ -30,9 +30,14 @@ const LANES: usize = 16;
 ///
 /// # Panics
 /// If the shapes do not fit each other.
-pub fn layer_norm(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<3> {
-    let width = x.dims()[2];
-    assert_eq!((gamma.dims(), beta.dims()), ([width], [width]), "layer_norm: a scale and a shift per column");
+pub fn layer_norm(x: Tensor<3>, gamma: Tensor<3>, beta: Tensor<3>) -> Tensor<3> {
+    let ([networks, _, width], [scales, one, columns]) = (x.dims(), gamma.dims());
+    assert_eq!(gamma.dims(), beta.dims(), "layer_norm: a shift per scale");
+    assert!(
+        (scales == networks || scales == 1) && (one, columns) == (1, width),
+        "layer_norm: {networks} networks of width {width}, scales {:?}",
+        gamma.dims()
+    );
     if !is_flex(&x) {
         return layer_norm_composed(x, gamma, beta);
     }
@@ -43,9 +48,11 @@ pub fn layer_norm(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<3> 
     ))
 }
 
-/// The definition of [`layer_norm`]: burn's own.
-pub fn layer_norm_composed(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<3> {
-    module::layer_norm(x, gamma, Some(beta), EPSILON as f64)
+/// The definition of [`layer_norm`], of burn's operations.
+pub fn layer_norm_composed(x: Tensor<3>, gamma: Tensor<3>, beta: Tensor<3>) -> Tensor<3> {
+    let centred = x.clone() - x.mean_dim(2);
+    let variance = centred.clone().square().mean_dim(2);
+    centred / (variance + EPSILON).sqrt() * gamma + beta
 }
 
 /// The fused normalisation as an operation of a backend.
@@ -94,14 +101,20 @@ impl Backward<Flex, 3> for NormGradient {
     fn backward(self, ops: Ops<Saved, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = grads.consume::<Flex>(&ops.node).to_contiguous();
         let Saved { x, gamma, inverse } = ops.state;
-        let width = slice(&gamma).len();
+        let [shape, scales] = [&x, &gamma].map(|t| t.layout().shape().to_vec());
         let mut dx = vec![0.0; slice(&x).len()];
-        let (mut dgamma, mut dbeta) = (vec![0.0; width], vec![0.0; width]);
-        rows_backward(slice(&x), slice(&gamma), &inverse, slice(&dy), &mut dx, &mut dgamma, &mut dbeta);
+        let (mut dgamma, mut dbeta) = (vec![0.0; slice(&gamma).len()], vec![0.0; slice(&gamma).len()]);
+        let (width, block) = (shape[2], block(dx.len(), &gamma));
+        let inputs = slice(&x).chunks(block).zip(slice(&dy).chunks(block)).zip(inverse.chunks(block / width));
+        let outputs = dx.chunks_mut(block).zip(dgamma.chunks_mut(width)).zip(dbeta.chunks_mut(width));
+        for ((((x, dy), inverse), gamma), ((dx, dgamma), dbeta)) in inputs.zip(slice(&gamma).chunks(width)).zip(outputs)
+        {
+            rows_backward(x, gamma, inverse, dy, dx, dgamma, dbeta);
+        }
         let [px, pgamma, pbeta] = ops.parents;
-        let shape: Vec<usize> = x.layout().shape().to_vec();
-        for (parent, gradient, shape) in [(px, dx, shape), (pgamma, dgamma, vec![width]), (pbeta, dbeta, vec![width])] {
+        for (parent, gradient, shape) in [(px, dx, &shape), (pgamma, dgamma, &scales), (pbeta, dbeta, &scales)] {
             if let Some(node) = parent {
+                let shape = shape.clone();
                 grads.register::<Flex>(node.id, FlexTensor::from_data(TensorData::new(gradient, shape)));
             }
         }
@@ -112,13 +125,24 @@ fn slice(t: &FlexTensor) -> &[f32] {
     t.as_slice().expect("a contiguous f32 tensor")
 }
 
+/// How many of `numbers` are in the rows that share a scale of `gamma`: at least one row, where there are none.
+fn block(numbers: usize, gamma: &FlexTensor) -> usize {
+    let shape = gamma.layout().shape();
+    (numbers / shape[0]).max(shape[2])
+}
+
 /// y, and mean and 1/σ of every row.
 fn forward(x: &FlexTensor, gamma: &FlexTensor, beta: &FlexTensor) -> (FlexTensor, Vec<[f32; 2]>) {
     let shape: Vec<usize> = x.layout().shape().to_vec();
-    let width = slice(gamma).len();
+    let width = shape[2];
     let mut y = vec![0.0; slice(x).len()];
     let mut inverse = vec![[0.0; 2]; y.len() / width];
-    rows_forward(slice(x), slice(gamma), slice(beta), &mut y, &mut inverse);
+    let block = block(y.len(), gamma);
+    let outputs = y.chunks_mut(block).zip(inverse.chunks_mut(block / width));
+    let scales = slice(gamma).chunks(width).zip(slice(beta).chunks(width));
+    for ((x, (gamma, beta)), (y, inverse)) in slice(x).chunks(block).zip(scales).zip(outputs) {
+        rows_forward(x, gamma, beta, y, inverse);
+    }
     (FlexTensor::from_data(TensorData::new(y, shape)), inverse)
 }
 
@@ -187,7 +211,9 @@ mod tests {
     #[test]
     fn fused_follows_the_composition() {
         let device = Device::flex().autodiff();
-        for (a, b, d) in [(2, 3, 1), (1, 4, 7), (5, 3, 16), (3, 9, 37), (4, 23, 128)] {
+        for (a, b, d, scales) in
+            [(2, 3, 1, 1), (1, 4, 7, 1), (5, 3, 16, 5), (5, 3, 16, 1), (3, 9, 37, 3), (4, 23, 128, 1), (2, 23, 128, 2)]
+        {
             let normal = |name: &str, n: usize| {
                 let mut data = vec![0.0; n];
                 fill_normal(&mut Streams::new(7).stream(name), &mut data);
@@ -195,7 +221,8 @@ mod tests {
             };
             let run = |fused: bool| {
                 let x = (normal("x", a * b * d) * 3.0 + 1.0).reshape([a, b, d]).detach().require_grad();
-                let (gamma, beta) = (normal("gamma", d).require_grad(), normal("beta", d).require_grad());
+                let [gamma, beta] = ["gamma", "beta"].map(|name| normal(name, scales * d));
+                let [gamma, beta] = [gamma, beta].map(|t| t.reshape([scales, 1, d]).detach().require_grad());
                 let norm = if fused { layer_norm } else { layer_norm_composed };
                 let y = norm(x.clone(), gamma.clone(), beta.clone());
                 let g = (y.clone() * normal("g", a * b * d).reshape([a, b, d])).sum().backward();
@@ -207,7 +234,10 @@ mod tests {
                 let scale = composed.iter().fold(1.0f32, |m, v| m.max(v.abs()));
                 // One number has no variance: what is left is rounding over √ε.
                 let tolerance = if d == 1 { 1e-3 } else { 2e-5 };
-                assert!(fused.iter().zip(&composed).all(|(f, c)| (f - c).abs() <= tolerance * scale), "{a} {b} {d}");
+                assert!(
+                    fused.iter().zip(&composed).all(|(f, c)| (f - c).abs() <= tolerance * scale),
+                    "{a} {b} {d} {scales}"
+                );
             }
         }
     }
