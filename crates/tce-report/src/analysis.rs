@@ -206,6 +206,13 @@ pub struct Analysis {
     pub resamples: usize,
 }
 
+impl Analysis {
+    /// Whether a table has to say that method `m` is published behaviour, because its title does not.
+    pub fn needs_mark(&self, m: usize) -> bool {
+        self.published[m] && !self.methods[m].title.contains("(published)")
+    }
+}
+
 /// What a run counts for.
 pub fn score(run: &Run) -> Option<f64> {
     match run.member.verdict {

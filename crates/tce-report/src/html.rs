@@ -106,7 +106,7 @@ fn classes(analysis: &Analysis) -> Vec<Series> {
 fn title_cell(analysis: &Analysis, m: usize) -> Markup {
     html! {
         (analysis.methods[m].title)
-        @if analysis.published[m] { " " span class="badge" { "published mode" } }
+        @if analysis.needs_mark(m) { " " span class="badge" { "published mode" } }
     }
 }
 

@@ -22,7 +22,7 @@ fn estimate(e: &Estimate, decimals: usize) -> String {
 }
 
 fn title(analysis: &Analysis, m: usize) -> String {
-    let mark = if analysis.published[m] { " (published mode)" } else { "" };
+    let mark = if analysis.needs_mark(m) { " (published mode)" } else { "" };
     format!("{}{mark}", analysis.methods[m].title)
 }
 

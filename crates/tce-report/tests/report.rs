@@ -276,6 +276,12 @@ fn whatever_is_wrong_is_said_first() {
         assert!(warned(&analysis, text), "{text}: {:#?}", analysis.warnings);
     }
     assert!(page.contains("published mode") && page.contains("15.0") && page.contains("†"));
+    let og = analysis.methods.iter().position(|m| m.id == "tce-og").unwrap();
+    assert!(analysis.needs_mark(og));
+    // Once is enough.
+    let mut told = analysis.clone();
+    told.methods[og].title = "TCE(OG) (published)".into();
+    assert!(!told.needs_mark(og) && !tce_report::text::markdown(&study, &told).contains("(published mode)"));
     assert!(page.find("Partial results").unwrap() < page.find("<table").unwrap());
     // A diverged policy is a result: 30 and 0.
     let c = analysis.comparison.unwrap();
