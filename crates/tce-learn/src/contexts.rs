@@ -19,7 +19,7 @@ pub(crate) struct Of<'a> {
     pub device: &'a Device,
 }
 
-/// z of the rows of a member's tables, under a world model that does not change any more: each is needed again and again.
+/// z of the rows of a member's tables, under a world model that does not change any more.
 ///
 /// They are computed when first asked for, in blocks that are always the same, so that a training that was resumed gets the
 /// same bits: a product of matrices may round a row differently among other rows.

@@ -163,9 +163,7 @@ impl MetaDt {
         config.check()?;
         let c = &config.world_model;
         let mut worlds = Worlds::new(buffer, c, device);
-        // A batch of nobody's: the world models draw segments.
-        let rows = Buffer::new(buffer.members().to_vec(), 2)?;
-        if !prepare(&mut worlds, &rows, c.steps, "Meta-DT world model", place, device)? {
+        if !prepare(&mut worlds, buffer, c.steps, "Meta-DT world model", place, device)? {
             return Ok(None);
         }
         let trainable = device.clone().autodiff();
@@ -251,8 +249,7 @@ impl Learner for MetaDt {
     }
 
     fn state(&self) -> NamedParameters {
-        let mut state = NamedParameters::default();
-        self.worlds.save(&mut state);
+        let mut state = self.worlds.state();
         for (m, nets) in self.members.iter().enumerate() {
             nets.transformer.save(&format!("transformer.{m}"), &mut state);
         }
@@ -260,7 +257,7 @@ impl Learner for MetaDt {
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.worlds.load(state, path)?;
+        self.worlds.restore(state, path)?;
         for (m, nets) in self.members.iter_mut().enumerate() {
             nets.transformer.load(&format!("transformer.{m}"), state, path)?;
             nets.contexts = Contexts::new(self.worlds.member(m).0, self.config.world_model.latent);

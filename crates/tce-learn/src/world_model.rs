@@ -274,22 +274,6 @@ impl Worlds {
         let (trajectories, model) = &self.members[m];
         (trajectories, &model.net().encoder)
     }
-
-    /// Adds the networks to `state`.
-    pub fn save(&self, state: &mut NamedParameters) {
-        for (m, (_, model)) in self.members.iter().enumerate() {
-            model.save(&format!("world.{m}"), state);
-        }
-    }
-
-    /// Takes them from `state`; `path` is where it came from, for messages.
-    ///
-    /// # Errors
-    /// If they belong to other networks.
-    pub fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        let mut members = self.members.iter_mut().enumerate();
-        members.try_for_each(|(m, (_, model))| model.load(&format!("world.{m}"), state, path))
-    }
 }
 
 impl Learner for Worlds {
@@ -314,12 +298,15 @@ impl Learner for Worlds {
 
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
-        self.save(&mut state);
+        for (m, (_, model)) in self.members.iter().enumerate() {
+            model.save(&format!("world.{m}"), &mut state);
+        }
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        self.load(state, path)
+        let mut members = self.members.iter_mut().enumerate();
+        members.try_for_each(|(m, (_, model))| model.load(&format!("world.{m}"), state, path))
     }
 }
 

@@ -56,7 +56,8 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     let mut methods: Vec<Method> = Vec::new();
     for (variant, entry) in runs().filter_map(|e| Some((e.variant?, e))) {
         if !methods.iter().any(|m| m.id == entry.column()) {
-            methods.push(method(variant, &entry.label, Some(&sweep.manifest.config(entry)?)));
+            // Another version's configuration may have other keys; its runs are no worse for it.
+            methods.push(method(variant, &entry.label, sweep.manifest.config(entry).ok().as_ref()));
         }
     }
     let mut notes = Vec::new();
@@ -226,7 +227,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         }
         let label = id.strip_prefix(name.as_str()).unwrap_or_default().trim();
         let folder = finished.iter().zip(&ids).find(|(_, of)| *of == id).map(|((_, _, folder), _)| folder);
-        // Another version's configuration may have other keys; its runs are no worse for it.
+        // As above.
         let config = folder.and_then(|f| toml::from_str(&f.config).ok());
         methods.push(match Variant::from_str(name, false) {
             Ok(variant) => Method { id: id.clone(), ..method(variant, label, config.as_ref()) },
@@ -334,6 +335,7 @@ fn networks_of(generated: &Path) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sweep::Manifest;
 
     #[test]
     fn folders_name_their_task() {
@@ -353,14 +355,25 @@ mod tests {
         assert_eq!(method(Variant::DmcPublished, "", None).title, "DmC (published)");
     }
 
+    /// What another version planned can be reported, though not run.
+    #[test]
+    fn unknown_keys_of_a_plan_are_no_matter_of_its_report() {
+        let dir = tempfile::tempdir().unwrap();
+        let description = dir.path().join("old.toml");
+        fs::write(&description, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"dara-published\"]\n")
+            .unwrap();
+        let mut manifest = Manifest::plan(&description).unwrap();
+        manifest.header.configs.values_mut().for_each(|config| *config = format!("from_another_version = 1\n{config}"));
+        let sweep = Sweep::create(&dir.path().join("sweep"), manifest).unwrap();
+        assert!(sweep.manifest.config(&sweep.entries()[0]).is_err());
+        let study = of_sweep(&sweep).unwrap();
+        assert!(study.methods.iter().any(|m| m.title == "DARA (published)"), "{:?}", study.methods);
+    }
+
     #[test]
     fn all_floors_come_first() {
-        let methods = in_order(
-            vec![(Variant::TceOg, ""), (Variant::Bc, "y0.1"), (Variant::BcRaw, "")]
-                .into_iter()
-                .map(|(v, l)| method(v, l, None))
-                .collect(),
-        );
+        let some = [(Variant::TceOg, ""), (Variant::Bc, "y0.1"), (Variant::BcRaw, "")];
+        let methods = in_order(some.map(|(variant, label)| method(variant, label, None)).to_vec());
         let ids: Vec<&str> = methods.iter().map(|m| m.id.as_str()).collect();
         assert_eq!(ids, ["bc-raw", "bc y0.1", "bc-top", "target-only", "tce-og"]);
     }
