@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::random::{fill_normal, fill_uniform};
 use tce_base::{FileError, Progress, Sealed, Streams, read_sealed, write_sealed};
-use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, tensor};
+use tce_nn::{Device, NamedParameters, NetworkError, Tensor, host, on_threads_of, tensor};
 
 use crate::{BoundNetwork, Denoiser, DiffusionError, Guided, Level, NetworkConfig, Process, Sampler, ScoreNetwork};
 
@@ -178,7 +178,7 @@ impl ScoreModel {
             .enumerate()
             .flat_map(|(m, member)| member.chunks_mut(CHUNK * d).enumerate().map(move |(k, chunk)| (m, k, chunk)))
             .collect();
-        tasks.into_par_iter().try_for_each(|(m, k, chunk)| {
+        let sample = |(m, k, chunk): (usize, usize, &mut [f32])| {
             let n = chunk.len() / d;
             if let Some(kept) = &request.kept
                 && let Some(rows) = kept.load(request.name, m, k, chunk.len()).map_err(NetworkError::from)?
@@ -202,7 +202,8 @@ impl ScoreModel {
                 Some(kept) => Ok(kept.save(request.name, m, k, &rows).map_err(NetworkError::from)?),
                 None => Ok::<_, DiffusionError>(()),
             }
-        })?;
+        };
+        on_threads_of(&self.network.device(), || tasks.into_par_iter().try_for_each(sample))?;
         Ok(out)
     }
 

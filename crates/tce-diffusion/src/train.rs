@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
 use tce_base::{Progress, Streams, interrupted};
 use tce_nn::{
-    Averaged, Checkpoints, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host, tensor,
+    Averaged, Checkpoints, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host,
+    on_threads_of, tensor,
 };
 
 use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
@@ -161,6 +162,7 @@ impl Trainer {
         }
         let progress = Progress::new(format!("train {}", self.name), steps.saturating_sub(self.step), "steps");
         let (mut sum, mut count) = (None, 0u64);
+        let device = self.network.net().device();
         while self.step < steps {
             // Between two reports a checkpoint would have to hold the losses since the last one.
             let whole = count == 0;
@@ -172,7 +174,7 @@ impl Trainer {
                 let label = format!("training of {}", self.name);
                 return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
             }
-            let loss = self.step(data, steps);
+            let loss = on_threads_of(&device, || self.step(data, steps));
             sum = Some(match sum {
                 None => loss,
                 Some(sum) => sum + loss,

@@ -77,7 +77,7 @@ pub use sequence_policy::{SequencePolicy, SequenceSpec};
 pub use srpo::{Srpo, SrpoConfig};
 pub use td3_bc::{Td3Bc, Td3BcConfig};
 pub use training::{
-    Lane, Learner, Meter, Outcome, Place, PolicyLearner, Report, Steps, member_noise, prepare, train,
+    Journal, Lane, Learner, Meter, Outcome, Place, PolicyLearner, Report, Steps, member_noise, prepare, train,
     train_side_by_side,
 };
 pub use transition_model::{Densities, TransitionConfig, TransitionModel, train_transition_models};

@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Mutex;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams, interrupted, random::fill_normal};
-use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, tensor};
+use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, on_threads_of, tensor};
 
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
@@ -27,14 +28,34 @@ pub struct Place<'a> {
     pub key: &'a str,
     /// Which of several trainings side by side.
     pub lane: usize,
+    /// Takes the figures of what is trained before the first step.
+    pub journal: Option<&'a Journal>,
+}
+
+/// The figures of preparations, from lanes that may run side by side.
+#[derive(Debug, Default)]
+pub struct Journal(Mutex<Vec<(usize, String, Report)>>);
+
+impl Journal {
+    /// Lane, training and report, in the order of lanes and steps, whatever the order in which they came.
+    ///
+    /// # Panics
+    /// If a lane has panicked.
+    pub fn take(&self) -> Vec<(usize, String, Report)> {
+        let mut reports = std::mem::take(&mut *self.0.lock().expect("no lane has panicked"));
+        reports.sort_by_key(|(lane, ..)| *lane);
+        reports
+    }
 }
 
 /// How the checkpoints of [`prepare`] begin.
 const PREPARATION: &str = "prepare";
+/// Reports of a preparation.
+const PREPARATION_REPORTS: u64 = 10;
 
 impl Place<'_> {
     /// Nothing is kept.
-    pub const NONE: Place<'static> = Place { directory: None, key: "", lane: 0 };
+    pub const NONE: Place<'static> = Place { directory: None, key: "", lane: 0, journal: None };
 
     /// The checkpoints of the training `name` here.
     ///
@@ -61,7 +82,7 @@ impl Place<'_> {
 }
 
 /// Trains what a learner needs before its first step: `steps` steps on `buffer`, gone on with from the checkpoints at `place`, where
-/// the end is kept too. False if the user interrupted it.
+/// the end is kept too. Its figures go to the journal of `place`. False if the user interrupted it.
 ///
 /// # Errors
 /// If a checkpoint cannot be read or written.
@@ -76,8 +97,16 @@ pub fn prepare<L: Learner>(
     let name = format!("{PREPARATION}-{}-{}", label.replace(' ', "-"), place.lane);
     let mut checkpoints = place.checkpoints(&name)?;
     let mut lanes = [Lane { learner, buffer }];
-    let nothing = |_: usize, _: &Report, _: &L| Ok::<_, LearnError>(());
-    Ok(!advance(&mut lanes, Steps::new(steps, 0), label, &mut checkpoints, true, device, nothing)?.interrupted)
+    let steps = Steps::new(steps, (steps / PREPARATION_REPORTS).max(1));
+    let training = label.replace(' ', "-").to_lowercase();
+    let outcome = advance(&mut lanes, steps, label, &mut checkpoints, true, device, |_, report, _| {
+        if let Some(journal) = place.journal {
+            let mut reports = journal.0.lock().expect("no lane has panicked");
+            reports.push((place.lane, training.clone(), report.clone()));
+        }
+        Ok::<_, LearnError>(())
+    })?;
+    Ok(!outcome.interrupted)
 }
 
 /// Something that is trained one minibatch at a time, P members at once.
@@ -199,6 +228,12 @@ pub struct Report {
     pub metrics: BTreeMap<String, Vec<f64>>,
 }
 
+impl From<(u64, Meter)> for Report {
+    fn from((step, mut figures): (u64, Meter)) -> Self {
+        Self { step, metrics: figures.take() }
+    }
+}
+
 impl Report {
     /// Members with a figure that is not a finite number: their training has diverged. The others do not feel it.
     pub fn diverged(&self) -> Vec<usize> {
@@ -284,8 +319,8 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     advance(lanes, steps, label, checkpoints, false, device, on_report)
 }
 
-/// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own; its last report is not
-/// given again then.
+/// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own. Its reports are in the
+/// checkpoints and are all given at the end, those of an earlier process and of one that had nothing left to do included.
 fn advance<L: Learner + ?Sized, E: From<LearnError>>(
     lanes: &mut [Lane<L>],
     steps: Steps,
@@ -295,7 +330,7 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
     device: &Device,
     mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    let mut runs: Vec<_> = lanes.iter_mut().map(|lane| Run { lane, meter: Meter::default(), next: None }).collect();
+    let mut runs: Vec<_> = lanes.iter_mut().map(Run::new).collect();
     let mut step = steps.from;
     if let Some((at, state, path)) = checkpoints.restore() {
         for (k, run) in runs.iter_mut().enumerate() {
@@ -319,21 +354,34 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
             every => ((step / every + 1) * every).min(steps.to),
         };
         let turn = step..due.min(step + TURN);
-        runs.par_iter_mut().for_each(|run| run.advance(turn.clone(), steps.to, device, &progress));
+        on_threads_of(device, || {
+            runs.par_iter_mut().for_each(|run| run.advance(turn.clone(), steps.to, device, &progress));
+        });
         step = turn.end;
         if step == due {
             for (k, run) in runs.iter_mut().enumerate() {
-                let report = Report { step, metrics: run.meter.take() };
+                let figures = (step, std::mem::take(&mut run.meter));
+                let report = Report::from(figures.clone());
                 for member in report.diverged() {
                     eprintln!("{label}: member {} has diverged at step {step} (a loss is not finite)", k + member);
                 }
-                on_report(k, &report, run.lane.learner)?;
+                match keep_end {
+                    true => run.history.push(figures),
+                    false => on_report(k, &report, run.lane.learner)?,
+                }
             }
         }
     }
     progress.finish();
-    if keep_end && begun < steps.to {
-        checkpoints.keep(steps.to, state_of(&runs)).map_err(LearnError::from)?;
+    if keep_end {
+        if begun < steps.to {
+            checkpoints.keep(steps.to, state_of(&runs)).map_err(LearnError::from)?;
+        }
+        for (k, run) in runs.iter_mut().enumerate() {
+            for report in std::mem::take(&mut run.history).into_iter().map(Report::from) {
+                on_report(k, &report, run.lane.learner)?;
+            }
+        }
     }
     Ok(Outcome { step: steps.to.max(steps.from), interrupted: false })
 }
@@ -349,17 +397,24 @@ fn state_of<L: Learner + ?Sized>(runs: &[Run<L>]) -> NamedParameters {
 struct Run<'a, 'b, L: ?Sized> {
     lane: &'a mut Lane<'b, L>,
     meter: Meter,
+    /// Figures that were due and are given at the end, with their steps.
+    history: Vec<(u64, Meter)>,
     /// The batch of the next step.
     next: Option<Minibatch>,
 }
 
-impl<L: Learner + ?Sized> Run<'_, '_, L> {
+impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
+    fn new(lane: &'a mut Lane<'b, L>) -> Self {
+        Self { lane, meter: Meter::default(), history: Vec::new(), next: None }
+    }
+
     /// Adds the state of this lane, number `k`, to a checkpoint.
     fn keep(&self, k: usize, state: &mut NamedParameters) {
         let own = self.lane.learner.state();
         state.tensors.extend(own.tensors.into_iter().map(|(name, tensor)| (format!("{k}/{name}"), tensor)));
         state.metadata.extend(own.metadata.into_iter().map(|(name, value)| (format!("{k}/{name}"), value)));
-        state.metadata.insert(format!("{k}/meter"), serde_json::to_string(&self.meter).expect("plain data"));
+        let figures = serde_json::to_string(&(&self.meter, &self.history)).expect("plain data");
+        state.metadata.insert(format!("{k}/meter"), figures);
     }
 
     /// Puts back what [`Run::keep`] added.
@@ -371,7 +426,7 @@ impl<L: Learner + ?Sized> Run<'_, '_, L> {
         let metadata = state.metadata.iter();
         own.metadata.extend(metadata.filter_map(|(n, v)| Some((n.strip_prefix(&prefix)?.to_owned(), v.clone()))));
         let meter = own.metadata.remove("meter").and_then(|text| serde_json::from_str(&text).ok());
-        self.meter = meter.ok_or_else(|| NetworkError::Format {
+        (self.meter, self.history) = meter.ok_or_else(|| NetworkError::Format {
             path: path.to_owned(),
             reason: format!("no figures of lane {k}: no checkpoint of this training"),
         })?;

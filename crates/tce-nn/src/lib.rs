@@ -6,6 +6,8 @@
 //! [`Adam`], [`ResidualStack`]), of which
 //! the plain composition of burn operations is the definition and the test oracle.
 
+use std::sync::OnceLock;
+
 mod activation;
 mod adam;
 mod checkpoint;
@@ -44,7 +46,44 @@ pub fn is_cpu(device: &Device) -> bool {
     matches!(device.clone().inner().as_dispatch(), burn::backend::DispatchDevice::Flex(_))
 }
 
+/// Does `work` on the threads that operations on `device` are best called from: all of them for the CPU, one for a GPU, where what
+/// several threads queue has to be put in order again.
+///
+/// # Panics
+/// If that one thread cannot be started.
+pub fn on_threads_of<R: Send>(device: &Device, work: impl FnOnce() -> R + Send) -> R {
+    static ONE: OnceLock<rayon::ThreadPool> = OnceLock::new();
+    if is_cpu(device) {
+        return work();
+    }
+    let one = || rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread for the GPU");
+    ONE.get_or_init(one).install(work)
+}
+
 /// The CPU: burn's `flex` device, without autodiff.
 pub fn cpu() -> Device {
     Device::flex()
+}
+
+/// The first GPU that Vulkan offers, without autodiff; a software driver where there is nothing better.
+///
+/// # Errors
+/// If there is none, or the program was built without the feature `vulkan`.
+#[cfg(feature = "vulkan")]
+pub fn vulkan() -> Result<Device, NetworkError> {
+    use burn::tensor::wgpu::WgpuBackend;
+    // burn refuses to begin a second time.
+    static DEVICE: OnceLock<Result<Device, String>> = OnceLock::new();
+    let start = || Device::wgpu_options().graphics_api(WgpuBackend::Vulkan).init().map_err(|e| e.to_string());
+    let device = DEVICE.get_or_init(start).clone();
+    device.map_err(|e| NetworkError::NoGpu(format!("{e}; is there a Vulkan driver (`vulkaninfo --summary`)?")))
+}
+
+/// See the feature `vulkan`.
+///
+/// # Errors
+/// Always: the program was built without it.
+#[cfg(not(feature = "vulkan"))]
+pub fn vulkan() -> Result<Device, NetworkError> {
+    Err(NetworkError::NoGpu("this program was built for the CPU alone; build it with `--features vulkan`".into()))
 }

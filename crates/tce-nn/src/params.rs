@@ -39,6 +39,9 @@ pub enum NetworkError {
         /// What the network needs.
         expected: String,
     },
+    /// There is no GPU for the networks.
+    #[error("no GPU: {0}")]
+    NoGpu(String),
 }
 
 /// Parameters of a network as named host arrays, with free-text metadata; what a safetensors file holds.

@@ -23,7 +23,7 @@ use tce_learn::{
     Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
     MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
-use tce_nn::{Checkpoints, cpu, product_rate, tensor};
+use tce_nn::{Checkpoints, Device, is_cpu, product_rate, tensor};
 use tce_sim::{CollectOptions, UniformActor, collect};
 
 use crate::config::Algorithm;
@@ -54,38 +54,46 @@ impl Body {
 }
 
 /// Name, what it is, and how to set it up.
-type Workload = (&'static str, &'static str, fn() -> Body);
+type Workload = (&'static str, &'static str, fn(&On) -> Body);
+
+/// What a workload runs on.
+pub struct On {
+    /// The device of the networks.
+    pub device: Device,
+    /// Seeds of each learner.
+    pub seeds: u64,
+}
 
 /// Every workload, in the order of the table.
 const WORKLOADS: &[Workload] = &[
-    ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", || iql(1, RegulariserKind::None)),
-    ("iql-5", "the same, five seeds side by side (members' updates)", || iql(5, RegulariserKind::None)),
-    ("iql-kl", "IQL with the forward-KL term of Eq. 10", || iql(1, RegulariserKind::ForwardKl)),
-    ("dara", "DARA, the same sizes", || method(Algorithm::Dara)),
-    ("bosa", "BOSA", || method(Algorithm::Bosa)),
-    ("srpo", "SRPO", || method(Algorithm::Srpo)),
-    ("igdf", "IGDF", || method(Algorithm::Igdf)),
-    ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", || method(Algorithm::Otdf)),
-    ("dmc", "DmC's learner", || method(Algorithm::Dmc)),
-    ("td3-bc", "TD3+BC", || method(Algorithm::Td3Bc)),
-    ("rebrac", "ReBRAC", || method(Algorithm::Rebrac)),
+    ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", |on| iql(on, on.seeds, RegulariserKind::None)),
+    ("iql-5", "the same, five seeds side by side (members' updates)", |on| iql(on, 5, RegulariserKind::None)),
+    ("iql-kl", "IQL with the forward-KL term of Eq. 10", |on| iql(on, on.seeds, RegulariserKind::ForwardKl)),
+    ("dara", "DARA, the same sizes", |on| method(on, Algorithm::Dara)),
+    ("bosa", "BOSA", |on| method(on, Algorithm::Bosa)),
+    ("srpo", "SRPO", |on| method(on, Algorithm::Srpo)),
+    ("igdf", "IGDF", |on| method(on, Algorithm::Igdf)),
+    ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", |on| method(on, Algorithm::Otdf)),
+    ("dmc", "DmC's learner", |on| method(on, Algorithm::Dmc)),
+    ("td3-bc", "TD3+BC", |on| method(on, Algorithm::Td3Bc)),
+    ("rebrac", "ReBRAC", |on| method(on, Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
-    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", || meta_dt(false)),
-    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", || meta_dt(true)),
+    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", |on| meta_dt(on, false)),
+    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", |on| meta_dt(on, true)),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
-    ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", || score_eval(1024)),
-    ("score-eval-4k", "the same, 4 096 rows", || score_eval(4096)),
-    ("score-eval-16k", "the same, 16 384 rows", || score_eval(16_384)),
+    ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", |on| score_eval(on, 1024)),
+    ("score-eval-4k", "the same, 4 096 rows", |on| score_eval(on, 4096)),
+    ("score-eval-16k", "the same, 16 384 rows", |on| score_eval(on, 16_384)),
     ("sample", "states by DPM-Solver++ with 20 evaluations", sample),
     ("labels", "inverse dynamics and reward, 128 rows", labels),
     ("cvae", "behaviour CVAE, 256-256, 128 rows", cvae),
-    ("nearest", "nearest of 5 000 target rows, 40 dimensions (Eq. 9)", nearest),
-    ("transport", "Sinkhorn costs to 5 000 target rows, blocks of 2 500", transport),
-    ("env-halfcheetah", "environment steps", || environment(Agent::HalfCheetah)),
-    ("env-hopper", "environment steps", || environment(Agent::Hopper)),
-    ("env-walker2d", "environment steps", || environment(Agent::Walker2d)),
-    ("env-ant", "environment steps", || environment(Agent::Ant)),
+    ("nearest", "nearest of 5 000 target rows, 40 dimensions (Eq. 9)", |_| nearest()),
+    ("transport", "Sinkhorn costs to 5 000 target rows, blocks of 2 500", |_| transport()),
+    ("env-halfcheetah", "environment steps", |_| environment(Agent::HalfCheetah)),
+    ("env-hopper", "environment steps", |_| environment(Agent::Hopper)),
+    ("env-walker2d", "environment steps", |_| environment(Agent::Walker2d)),
+    ("env-ant", "environment steps", |_| environment(Agent::Ant)),
 ];
 
 /// The names of all workloads.
@@ -118,10 +126,15 @@ pub struct Measured {
 ///
 /// # Panics
 /// If there is no such workload ([`names`]).
-pub fn measure(name: &str, repeats: usize, seconds: f64) -> Result<Measured> {
+pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Measured> {
     let &(name, title, make) = WORKLOADS.iter().find(|w| w.0 == name).expect("a known workload");
-    let mut body = make();
-    (body.call)();
+    let mut body = make(on);
+    let mut call = || {
+        (body.call)();
+        // A GPU works behind the program's back.
+        on.device.sync().expect("a device that works");
+    };
+    call();
     let threads = rayon::current_num_threads() as f64;
     let (mut rates, mut shares) = (Vec::new(), Vec::new());
     let mut before = product_rate(PROBE);
@@ -132,7 +145,7 @@ pub fn measure(name: &str, repeats: usize, seconds: f64) -> Result<Measured> {
         let started = Instant::now();
         let mut calls = 0u32;
         while calls == 0 || started.elapsed().as_secs_f64() < seconds {
-            (body.call)();
+            call();
             calls += 1;
         }
         let rate = f64::from(calls) * body.units / started.elapsed().as_secs_f64();
@@ -188,17 +201,18 @@ fn members(seeds: u64) -> Vec<Member> {
 }
 
 /// Ten steps a call of learners side by side, as [`crate::learning`] trains them.
-fn learning<L: Learner + ?Sized + 'static>(lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+fn learning<L: Learner + ?Sized + 'static>(device: &Device, lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+    let (device, seeds) = (device.clone(), lanes.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
     let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = lanes.into_iter().unzip();
     let mut from = 0;
-    Body::new("updates", 10.0 * learners.len() as f64, flops, move || {
+    Body::new("updates", 10.0 * seeds as f64, flops, move || {
         let mut lanes: Vec<_> = learners
             .iter_mut()
             .zip(&buffers)
             .map(|(learner, buffer)| Lane { learner: learner.as_mut(), buffer })
             .collect();
         let steps = Steps { from, to: from + 10, report_every: 0 };
-        let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &cpu(), |_, _, _| {
+        let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &device, |_, _, _| {
             Ok::<_, LearnError>(())
         });
         done.expect("nothing to fail");
@@ -212,18 +226,26 @@ fn row_products(widths: &[usize]) -> (f64, f64) {
     (all as f64, (widths[0] * widths[1]) as f64)
 }
 
-fn iql(seeds: u64, kind: RegulariserKind) -> Body {
+/// The seeds as [`crate::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
+fn lanes<L>(on: &On, seeds: u64, lane: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
+    let all = members(seeds);
+    let size = if is_cpu(&on.device) { 1 } else { all.len() };
+    all.chunks(size).map(|members| lane(members.to_vec())).collect()
+}
+
+fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
     let config = IqlConfig { regulariser: kind, ..IqlConfig::default() };
     let small = RegulariserConfig {
         cvae: CvaeConfig { hidden: vec![64], steps: 10, ..CvaeConfig::default() },
         ..Default::default()
     };
-    let lane = |member: Member| {
-        let buffer = Buffer::new(vec![member], BATCH).expect("good data");
-        let regulariser = Regulariser::prepare(kind, &buffer, &small, Place::NONE, &cpu())
+    let device = &on.device;
+    let lane = |members| {
+        let buffer = Buffer::new(members, BATCH).expect("good data");
+        let regulariser = Regulariser::prepare(kind, &buffer, &small, Place::NONE, device)
             .expect("defaults")
             .expect("not interrupted");
-        let learner = Iql::new(&buffer, &config, regulariser, 1 << 40, &cpu()).expect("defaults");
+        let learner = Iql::new(&buffer, &config, regulariser, 1 << 40, device).expect("defaults");
         (buffer, Box::new(learner))
     };
     let ((v, v1), (q, q1), (pi, pi1)) = (
@@ -233,48 +255,52 @@ fn iql(seeds: u64, kind: RegulariserKind) -> Body {
     );
     // V(s) and V(s'), the gradient of V; twins: target, online, gradient; policy and gradient. No gradient of an input.
     let products = 2.0 * v + (2.0 * v - v1) + 2.0 * (2.0 * q + 2.0 * q - q1) + (3.0 * pi - pi1);
-    learning(members(seeds).into_iter().map(lane).collect(), 2.0 * BATCH as f64 * products)
+    learning(device, lanes(on, seeds, lane), 2.0 * BATCH as f64 * products)
 }
 
-fn sac() -> Body {
+fn sac(On { device, .. }: &On) -> Body {
     let buffer = Buffer::new(members(1), BATCH).expect("good data");
-    let learner = Sac::new(&buffer, &SacConfig::default(), &cpu()).expect("defaults");
+    let learner = Sac::new(&buffer, &SacConfig::default(), device).expect("defaults");
     let (q, q1) = row_products(&[OBS + ACT, WIDTH, WIDTH, 1]);
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, 2 * ACT]);
     // Policy at s' and s, with its gradient; critics: target, online, gradient, and to the action and back.
     let products = (4.0 * pi - pi1) + 2.0 * (q + 3.0 * q - q1 + 2.0 * q);
-    learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * products)
+    learning(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * products)
 }
 
 /// A method as the default preset has it, with target and source rows; what it trains before its first step is not timed.
-fn method(algorithm: Algorithm) -> Body {
+fn method(on: &On, algorithm: Algorithm) -> Body {
     let layered = Layered::new(Preset::Default, None, None, None, &[]);
     let mut config = layered.and_then(|l| l.config()).expect("the default preset").learner;
     (config.algorithm, config.iql.regulariser) = (algorithm, RegulariserKind::None);
     (config.behaviour.cvae.steps, config.igdf.steps, config.bosa.cvae.steps) = (1, 1, 1);
-    let mut member = members(1).remove(0);
-    member.row_scores = Some(Arc::new((0..member.parts[1].len()).map(|i| (i % 97) as f32).collect()));
-    let buffer = Buffer::new(vec![member], BATCH).expect("good data");
-    let learner = build(&buffer, &config, Place::NONE, &cpu()).expect("defaults");
-    learning(vec![(buffer, learner)], 0.0)
+    let lane = |mut members: Vec<Member>| {
+        for member in &mut members {
+            member.row_scores = Some(Arc::new((0..member.parts[1].len()).map(|i| (i % 97) as f32).collect()));
+        }
+        let buffer = Buffer::new(members, BATCH).expect("good data");
+        let learner = build(&buffer, &config, Place::NONE, &on.device).expect("defaults");
+        (buffer, learner)
+    };
+    learning(&on.device, lanes(on, on.seeds, lane), 0.0)
 }
 
-fn bc() -> Body {
+fn bc(On { device, .. }: &On) -> Body {
     let buffer = Buffer::new(members(1), BATCH).expect("good data");
-    let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, &cpu()).expect("defaults");
+    let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, device).expect("defaults");
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, ACT]);
-    learning(vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
+    learning(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
 }
 
 /// The transformer's updates, or those of its `world` model.
-fn meta_dt(world: bool) -> Body {
+fn meta_dt(On { device, .. }: &On, world: bool) -> Body {
     let mut c = MetaDtConfig::default();
     c.world_model.steps = 0;
     // Few rows: their contexts, which a training computes once, are all there after the warm-up.
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(BATCH).expect("target rows");
     let learner: Box<dyn Learner> = match world {
-        true => Box::new(Worlds::new(&buffer, &c.world_model, &cpu())),
-        false => Box::new(MetaDt::new(&buffer, &c, Place::NONE, &cpu()).expect("defaults").expect("not interrupted")),
+        true => Box::new(Worlds::new(&buffer, &c.world_model, device)),
+        false => Box::new(MetaDt::new(&buffer, &c, Place::NONE, device).expect("defaults").expect("not interrupted")),
     };
     let (w, square) = (&c.world_model, (c.embed * c.embed) as f64);
     let products = if world {
@@ -290,24 +316,24 @@ fn meta_dt(world: bool) -> Body {
         let step = OBS * w.features + (1 + w.features + w.latent + 2 * ACT) * c.embed;
         blocks + last + states * step as f64
     };
-    learning(vec![(buffer, learner)], 2.0 * c.batch as f64 * 3.0 * products)
+    learning(device, vec![(buffer, learner)], 2.0 * c.batch as f64 * 3.0 * products)
 }
 
-fn cvae() -> Body {
+fn cvae(On { device, .. }: &On) -> Body {
     let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::default() };
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(config.batch).expect("target rows");
-    let learner = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", &cpu()).expect("defaults");
+    let learner = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", device).expect("defaults");
     let latent = config.latent_per_action * ACT;
     let (encoder, first) = row_products(&[OBS + ACT, WIDTH, WIDTH, 2 * latent]);
     let (decoder, _) = row_products(&[OBS + latent, WIDTH, WIDTH, ACT]);
     let flops = 2.0 * config.batch as f64 * (3.0 * (encoder + decoder) - first);
-    learning(vec![(buffer, Box::new(learner))], flops)
+    learning(device, vec![(buffer, Box::new(learner))], flops)
 }
 
-fn labels() -> Body {
+fn labels(On { device, .. }: &On) -> Body {
     let config = LabelConfig::default();
     let all = members(1);
-    let models = LabelModels::new(&all, &config, &cpu()).expect("defaults");
+    let models = LabelModels::new(&all, &config, device).expect("defaults");
     let buffer = Buffer::new(all, BATCH).expect("good data").target_only(config.batch).expect("target rows");
     let model = |out: usize| {
         let mut widths = vec![2 * OBS];
@@ -316,7 +342,7 @@ fn labels() -> Body {
         let (all, first) = row_products(&widths);
         3.0 * all - first
     };
-    learning(vec![(buffer, Box::new(models))], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
+    learning(device, vec![(buffer, Box::new(models))], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
 }
 
 /// Multiply-adds per row of a score network: all of it, and what is left of it when time and condition are put in.
@@ -327,17 +353,17 @@ fn score_products(spec: &NetworkConfig) -> (f64, f64) {
     ((embeddings + trunk) as f64, trunk as f64)
 }
 
-fn trainer(spec: NetworkConfig) -> Trainer {
+fn trainer(device: &Device, spec: NetworkConfig) -> Trainer {
     let process = Process::Edm(Edm::default());
-    Trainer::new("bench", spec, process, TrainConfig::default(), &[Streams::new(0)], &cpu()).expect("sizes")
+    Trainer::new("bench", spec, process, TrainConfig::default(), &[Streams::new(0)], device).expect("sizes")
 }
 
-fn score_train() -> Body {
+fn score_train(On { device, .. }: &On) -> Body {
     let spec = NetworkConfig::new(OBS, 1);
     // Both live as long as the process: the training data borrows them.
     let [source, target] = [table(2, 200_000), table(1, 5_000)].map(|t| &*Box::leak(Box::new(t)));
     let data = ScoreData::labelled(&source.observations, &target.observations, OBS, true).expect("rows");
-    let mut trainer = trainer(spec);
+    let mut trainer = trainer(device, spec);
     let batch = TrainConfig::default().batch as f64;
     let inputs = (2 * spec.embedding + spec.dims * spec.width) as f64;
     let mut steps = 0;
@@ -347,17 +373,17 @@ fn score_train() -> Body {
     })
 }
 
-fn model() -> (ScoreModel, NetworkConfig) {
+fn model(device: &Device) -> (ScoreModel, NetworkConfig) {
     let spec = NetworkConfig::new(OBS, 1);
-    (trainer(spec).model(), spec)
+    (trainer(device, spec).model(), spec)
 }
 
-fn score_eval(rows: usize) -> Body {
-    let (model, spec) = model();
+fn score_eval(On { device, .. }: &On, rows: usize) -> Body {
+    let (model, spec) = model(device);
     let mut x = vec![0.0; rows * OBS];
     fill_normal(&mut Streams::new(1).stream("x"), &mut x);
-    let x = tensor(x, [1, rows, OBS], &cpu());
-    let labels = tensor(uniform_labels(&Streams::new(1), "y", rows, 0.2), [1, rows, 1], &cpu());
+    let x = tensor(x, [1, rows, OBS], device);
+    let labels = tensor(uniform_labels(&Streams::new(1), "y", rows, 0.2), [1, rows, 1], device);
     let level = model.process().level(0.5);
     // The model outlives every binding of it; both are dropped with the workload.
     let model: &'static ScoreModel = Box::leak(Box::new(model));
@@ -365,8 +391,8 @@ fn score_eval(rows: usize) -> Body {
     Body::new("rows", rows as f64, 2.0 * score_products(&spec).1, move || drop(denoiser.denoise(x.clone(), level)))
 }
 
-fn sample() -> Body {
-    let (model, spec) = model();
+fn sample(On { device, .. }: &On) -> Body {
+    let (model, spec) = model(device);
     let (rows, sampler) = (16_384, Sampler::DpmSolver { steps: 20 });
     let labels = uniform_labels(&Streams::new(0), "y", rows, 0.2);
     let flops = 2.0 * score_products(&spec).1 * sampler.evaluations() as f64;
@@ -415,8 +441,9 @@ mod tests {
 
     #[test]
     fn every_workload_runs() {
+        let on = On { device: tce_nn::cpu(), seeds: 2 };
         for name in ["iql", "iql-kl", "sac", "score-train", "score-eval-1k", "cvae", "labels", "env-hopper"] {
-            let m = measure(name, 1, 0.0).unwrap();
+            let m = measure(name, 1, 0.0, &on).unwrap();
             assert!(m.per_second > 0.0 && m.range == [m.per_second; 2], "{name}");
         }
     }
@@ -426,7 +453,8 @@ mod tests {
     fn an_iql_update_has_its_flops() {
         let (v, q, pi) = (70_144.0, 71_680.0, 71_424.0);
         let products = 2.0 * v + 2.0 * v - 4_352.0 + 2.0 * (4.0 * q - 5_888.0) + 3.0 * pi - 4_352.0;
-        assert_eq!(iql(1, RegulariserKind::None).flops, 512.0 * products);
+        let on = On { device: tce_nn::cpu(), seeds: 1 };
+        assert_eq!(iql(&on, 1, RegulariserKind::None).flops, 512.0 * products);
     }
 
     #[test]

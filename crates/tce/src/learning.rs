@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::{
-    Buffer, Lane, Member, Place, Policy, PolicyLearner, RewardScale, Steps, best_trajectories, return_range_scale,
-    train_side_by_side,
+    Buffer, Journal, Lane, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, best_trajectories,
+    return_range_scale, train_side_by_side,
 };
 use tce_nn::{Device, is_cpu};
 use tce_sim::SimError;
@@ -20,6 +20,7 @@ use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
 use crate::methods::build;
 use crate::metrics::Metrics;
+use crate::processor::Processor;
 use crate::units::even_standardizer;
 
 /// The data of one member: target rows, and perhaps others.
@@ -46,6 +47,9 @@ pub struct Learned {
     pub figures: BTreeMap<String, Vec<Option<f64>>>,
     /// Seconds of training.
     pub seconds: f64,
+    /// What computed it.
+    #[serde(default)]
+    pub device: Processor,
 }
 
 impl Learned {
@@ -68,7 +72,8 @@ pub fn learn(
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<Learned> {
     let started = std::time::Instant::now();
-    let place = Place { directory: Some(directory), key, lane: 0 };
+    let journal = Journal::default();
+    let place = Place { directory: Some(directory), key, lane: 0, journal: Some(&journal) };
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
     let size = if is_cpu(device) { 1 } else { data.len().max(1) };
     let start = |(lane_number, data)| lane(data, config, Place { lane: lane_number, ..place }, device);
@@ -80,19 +85,24 @@ pub fn learn(
     let updates = config.steps;
     let steps = Steps::new(updates, (updates / 50).max(1));
     let label = format!("learn {} {seeds:?}", config.algorithm.method().name);
-    let mut learned = Learned::default();
+    let mut learned = Learned { device: device.into(), ..Learned::default() };
     let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
-    let metrics = &mut Metrics::resume(directory, |_, at| at <= from)?;
+    // What was trained before the first step is told anew as long as there is no later checkpoint, and whole in any case.
+    let metrics = &mut Metrics::resume(directory, |stage, at| {
+        from > 0 && (at <= from || !["learn", "evaluate"].contains(&stage))
+    })?;
+    if from == 0 {
+        for (lane, training, report) in journal.take() {
+            log(metrics, &training, &report, lane * size)?;
+        }
+    }
     // The number of the last evaluation, which came with the last report.
     let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
     let mut judged = vec![number(from - from % steps.report_every); lanes.len()];
     let outcome = train_side_by_side(&mut lanes, steps, &label, &mut checkpoints, device, |k, report, learner| {
-        for (m, _) in seeds.iter().enumerate().skip(k * size).take(size) {
-            let figures = report.metrics.iter().map(|(name, v)| (name.as_str(), v[m - k * size]));
-            metrics.log("learn", report.step, m, figures)?;
-        }
+        log(metrics, "learn", report, k * size)?;
         for (name, values) in &report.metrics {
             let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![None; seeds.len()]);
             for (figure, value) in figures[k * size..].iter_mut().zip(values) {
@@ -124,6 +134,15 @@ pub fn learn(
     checkpoints.remove();
     place.discard_preparations();
     Ok(learned)
+}
+
+/// Logs a report of `stage` on members `first` and following.
+fn log(metrics: &mut Metrics, stage: &str, report: &Report, first: usize) -> Result<()> {
+    let members = report.metrics.values().map(Vec::len).max().unwrap_or(0);
+    for m in 0..members {
+        metrics.log(stage, report.step, first + m, report.metrics.iter().map(|(name, v)| (name.as_str(), v[m])))?;
+    }
+    Ok(())
 }
 
 /// The members of `data` as one training, before its first step.

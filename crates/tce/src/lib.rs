@@ -20,6 +20,7 @@ mod metrics;
 mod mixture;
 mod output;
 mod pipeline;
+mod processor;
 mod scratch;
 mod stage;
 mod stand_ins;

@@ -118,3 +118,13 @@ fn a_full_disk_leaves_nothing_behind() {
     assert!(message.to_lowercase().contains("space"), "{message}");
     assert_eq!(left, 0, "nothing half-written");
 }
+
+#[cfg(not(feature = "vulkan"))]
+#[test]
+fn a_gpu_that_the_program_was_not_built_for_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let output = tce(dir.path(), &["--device", "vulkan", "run", "hopper-morph:medium->expert"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(message(&output).contains("--features vulkan"), "{}", message(&output));
+    assert_eq!(common::files(dir.path()), Vec::<std::path::PathBuf>::new());
+}

@@ -123,6 +123,18 @@ fn every_rival_runs_and_says_its_mode() {
         assert_eq!(row["mode"] == "corrected", rival && !published);
         let left = files(&dir.path().join(row["directory"].as_str().unwrap()));
         assert!(left.iter().all(|p| p.extension().is_none_or(|e| e != "checkpoint")), "{left:?}");
+        let metrics =
+            fs::read_to_string(dir.path().join(row["directory"].as_str().unwrap()).join("metrics.jsonl")).unwrap();
+        let prepared = match row["variant"].as_str().unwrap() {
+            "bosa" | "bosa-published" => Some("bosa-autoencoders"),
+            "igdf" => Some("igdf-encoders"),
+            "otdf" | "otdf-published" => Some("behaviour-cvae"),
+            _ => None,
+        };
+        let before: Vec<_> = metrics.lines().take_while(|l| !l.contains(r#""stage":"learn""#)).collect();
+        assert_eq!(before.is_empty(), prepared.is_none(), "{row}: {before:?}");
+        let stage = prepared.map(|stage| format!(r#""stage":"{stage}""#));
+        assert!(before.iter().all(|l| l.contains(stage.as_ref().unwrap())), "{before:?}");
     }
     let config =
         fs::read_to_string(dir.path().join(rows[8]["directory"].as_str().unwrap()).join("config.toml")).unwrap();

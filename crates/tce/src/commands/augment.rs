@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 use tce_data::{Transitions, save_d4rl};
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::error::Result;
 use crate::expand::{Generated, expand};
@@ -51,11 +51,11 @@ struct Augmented {
 
 impl Augment {
     /// Runs the command.
-    pub fn run(self, output: Output) -> Result<()> {
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
         super::refuse_existing(&self.out, self.force)?;
         let config = self.config.layered(None, None)?.config()?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target)?.with_target_rows(config.target.rows);
-        let expansion = expand(&inputs, &config, &[self.seed], &self.cache, &cpu())?;
+        let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;
         let (generated, report) = (&expansion.tables[0], expansion.reports[0].clone());
         let target = &inputs.target.rows;
         let mut rows = Transitions::with_capacity(target.obs_dim, target.act_dim, target.len() + generated.len());

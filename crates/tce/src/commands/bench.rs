@@ -6,10 +6,13 @@ use clap::Args;
 use serde::Serialize;
 use tce_base::{set_quiet, write_json};
 
-use crate::bench::{Measured, measure, names};
+use tce_nn::Device;
+
+use crate::bench::{Measured, On, measure, names};
 use crate::error::{Error, Result};
 use crate::layers::{Layered, Preset};
 use crate::output::{Output, table};
+use crate::processor::Processor;
 
 /// Arguments of `bench`.
 #[derive(Debug, Args)]
@@ -23,6 +26,9 @@ pub struct Bench {
     /// Seconds a repeat takes.
     #[arg(long, default_value_t = 0.5)]
     seconds: f64,
+    /// Seeds of each learner (iql, iql-kl, and the methods); every member's update counts.
+    #[arg(long, default_value_t = 1)]
+    seeds: u64,
     /// Write the results to this file as JSON, too.
     #[arg(long)]
     out: Option<PathBuf>,
@@ -32,6 +38,9 @@ pub struct Bench {
 struct Report {
     program: String,
     processor: String,
+    /// What computed the networks.
+    device: Processor,
+    seeds: u64,
     instructions: &'static str,
     threads: usize,
     /// GFLOP/s of one core in products of 256 × 256 matrices, the best of the whole run.
@@ -53,25 +62,28 @@ struct WholeTask {
 
 impl Bench {
     /// Runs the command.
-    pub fn run(self, output: Output) -> Result<()> {
-        if self.repeats == 0 || self.seconds.is_nan() || self.seconds < 0.0 {
-            return Err(Error::Usage("--repeats must be at least 1, --seconds not negative".into()));
+    pub fn run(self, output: Output, kind: Processor, device: &Device) -> Result<()> {
+        if self.repeats == 0 || self.seeds == 0 || self.seconds.is_nan() || self.seconds < 0.0 {
+            return Err(Error::Usage("--repeats and --seeds must be at least 1, --seconds not negative".into()));
         }
         set_quiet(true);
         let names: Vec<&str> = match self.workloads.is_empty() {
             true => names().collect(),
             false => self.workloads.iter().map(String::as_str).collect(),
         };
+        let on = On { device: device.clone(), seeds: self.seeds };
         let mut core_gflops = tce_nn::product_rate(0.1);
         let mut workloads = Vec::new();
         for name in names {
             eprintln!("{name} ...");
-            workloads.push(measure(name, self.repeats, self.seconds)?);
+            workloads.push(measure(name, self.repeats, self.seconds, &on)?);
             core_gflops = core_gflops.max(tce_nn::product_rate(0.05));
         }
         let report = Report {
             program: crate::PROGRAM.to_owned(),
             processor: processor(),
+            device: kind,
+            seeds: self.seeds,
             instructions: tce_nn::instructions(),
             threads: rayon::current_num_threads(),
             core_gflops,

@@ -7,7 +7,7 @@ use clap::Args;
 use serde::Serialize;
 use tce_base::{sha256_file, sha256_hex};
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, parse_environment};
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::actors::Arena;
 use crate::config::Algorithm;
@@ -63,7 +63,7 @@ struct Report {
 
 impl Learn {
     /// Runs the command.
-    pub fn run(mut self, output: Output) -> Result<()> {
+    pub fn run(mut self, output: Output, device: &Device) -> Result<()> {
         // clap asks for the files unless the list is wanted.
         let (Some(target_file), Some(out)) = (self.target.take(), self.out.take()) else {
             output.print(&Algorithm::ALL.map(Algorithm::method), list);
@@ -113,7 +113,7 @@ impl Learn {
         let place = (out.as_path(), key.as_str());
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
-        let learned = learn(data, &config.learner, &config.evaluation, arena, place, &cpu(), |policies| {
+        let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
             for (policy, seed) in policies.iter().zip(&seeds) {
                 let file = out.join(format!("policy-seed{seed}.safetensors"));
                 policy.save(&file)?;

@@ -6,6 +6,7 @@ use clap::{Parser, Subcommand};
 
 use crate::error::{Error, Result};
 use crate::output::Output;
+use crate::processor::Processor;
 
 mod augment;
 mod bench;
@@ -35,6 +36,9 @@ pub struct Cli {
     /// Seconds between two checkpoints of a long stage. What a killed command loses, not what it computes, depends on it.
     #[arg(long, global = true, value_name = "SECONDS", default_value_t = 60.0)]
     save_every: f64,
+    /// What computes the networks.
+    #[arg(long, global = true, value_enum, default_value_t)]
+    device: Processor,
     #[command(subcommand)]
     command: Command,
 }
@@ -87,21 +91,22 @@ impl Cli {
             return Err(Error::Usage(format!("--save-every {}: expected a number of seconds", self.save_every)));
         }
         tce_nn::set_checkpoint_seconds(self.save_every);
+        let device = self.device.device()?;
         let output = Output { json: self.json };
         match self.command {
-            Command::Run(args) => args.run(output),
-            Command::Augment(args) => args.run(output),
-            Command::Learn(args) => args.run(output),
+            Command::Run(args) => args.run(output, &device),
+            Command::Augment(args) => args.run(output, &device),
+            Command::Learn(args) => args.run(output, &device),
             Command::Evaluate(args) => args.run(output),
-            Command::TrainSac(args) => args.run(output),
+            Command::TrainSac(args) => args.run(output, &device),
             Command::Zoo(command) => command.run(output),
             Command::Collect(args) => args.run(output),
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),
-            Command::Diagnose(command) => command.run(output),
-            Command::Sweep(command) => command.run(output, self.save_every),
+            Command::Diagnose(command) => command.run(output, &device),
+            Command::Sweep(command) => command.run(output, self.save_every, (self.device, &device)),
             Command::Report(args) => args.run(output),
-            Command::Bench(args) => args.run(output),
+            Command::Bench(args) => args.run(output, self.device, &device),
         }
     }
 }

@@ -3,7 +3,7 @@
 use clap::Args;
 use serde::Serialize;
 use tce_data::Task;
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::config::Algorithm;
 use crate::error::Result;
@@ -59,7 +59,7 @@ struct Row {
 
 impl Run {
     /// Runs the command.
-    pub fn run(self, output: Output) -> Result<()> {
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
         let mut variants: Vec<(Variant, bool)> = Vec::new();
         if !self.no_floors {
             let floors = Variant::FLOORS.into_iter().filter(|f| !self.variant.contains(f));
@@ -81,7 +81,7 @@ impl Run {
         let mut rows = Vec::new();
         for ((variant, floor), config) in variants.into_iter().zip(&configs) {
             let place = self.task.directory();
-            let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, &cpu())?;
+            let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, device)?;
             rows.push(Row { title: variant.row_title(config), variant, floor, summary });
         }
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);

@@ -7,9 +7,11 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use tce_base::interrupted;
+use tce_nn::Device;
 
 use crate::error::{Error, Result};
 use crate::output::{Output, table};
+use crate::processor::Processor;
 use crate::sweep::local::Share;
 use crate::sweep::slurm::{Array, Submission};
 use crate::sweep::{Kind, Manifest, Sweep};
@@ -117,11 +119,11 @@ pub struct Gather {
 
 impl SweepCommand {
     /// Runs the command.
-    pub fn run(self, output: Output, save_every: f64) -> Result<()> {
+    pub fn run(self, output: Output, save_every: f64, (processor, device): (Processor, &Device)) -> Result<()> {
         match self {
             SweepCommand::Plan(args) => args.run(output),
-            SweepCommand::Launch(args) => args.run(output, save_every),
-            SweepCommand::RunOne(args) => args.run(output),
+            SweepCommand::Launch(args) => args.run(output, save_every, processor),
+            SweepCommand::RunOne(args) => args.run(output, device),
             SweepCommand::Status(args) => args.run(output),
             SweepCommand::Gather(args) => args.run(output),
         }
@@ -175,7 +177,7 @@ struct Submitted {
 }
 
 impl Launch {
-    fn run(self, output: Output, save_every: f64) -> Result<()> {
+    fn run(self, output: Output, save_every: f64, processor: Processor) -> Result<()> {
         if self.threads_each == 0 || self.workers == Some(0) || self.pack == 0 {
             return Err(Error::Usage("--workers, --threads-each and --pack must be at least 1".into()));
         }
@@ -186,6 +188,7 @@ impl Launch {
                     pack: self.pack,
                     threads: self.threads_each,
                     save_every,
+                    processor,
                     grace: self.grace,
                     arguments: self.sbatch,
                     dry_run: self.dry_run,
@@ -212,7 +215,7 @@ impl Launch {
             Launcher::Local => {
                 let cores = std::thread::available_parallelism().map_or(1, usize::from);
                 let workers = self.workers.unwrap_or((cores / self.threads_each).max(1));
-                let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every };
+                let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every, processor };
                 let failed = sweep.launch_here(share)?;
                 let status = sweep.status()?;
                 output.print(&status, |s| s.render());
@@ -229,7 +232,7 @@ impl Launch {
 }
 
 impl RunOne {
-    fn run(self, output: Output) -> Result<()> {
+    fn run(self, output: Output, device: &Device) -> Result<()> {
         let sweep = Sweep::open(&self.directory)?;
         let count = sweep.entries().len();
         if let Some(index) = self.indices.iter().find(|i| **i >= count) {
@@ -238,7 +241,7 @@ impl RunOne {
         let mut outcomes = Vec::new();
         let mut failed = None;
         for &index in &self.indices {
-            match sweep.work(&sweep.entries()[index]) {
+            match sweep.work(&sweep.entries()[index], device) {
                 Ok(outcome) => outcomes.push(outcome),
                 // The work's own checkpoint is written; the rest of the list comes in the next turn.
                 Err(e) if e.exit_code() == 130 => return Err(e),

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use tce_data::{Agent, Shift, parse_environment, save_d4rl};
 use tce_learn::sac::SacConfig;
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::acting::{Goal, Ledger, Settings, Training};
 use crate::error::{Error, Result};
@@ -78,7 +78,7 @@ struct Row {
 
 impl TrainSac {
     /// Runs the command.
-    pub fn run(self, output: Output) -> Result<()> {
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
         let counts = [self.seeds, self.episodes as u64, self.evaluate_every, self.start, self.steps_per_update];
         if counts.contains(&0) || self.batch == 0 {
             let message =
@@ -112,7 +112,7 @@ impl TrainSac {
                     sac: SacConfig::default(),
                 };
                 let directory = self.out.join(format!("{agent}-{shift}-seed{seed}"));
-                let training = Training::open(&directory, settings, self.from.as_deref(), goal.clone(), &cpu())?;
+                let training = Training::open(&directory, settings, self.from.as_deref(), goal.clone(), device)?;
                 trainings.push((format!("{agent}-{shift}"), seed, directory, training));
             }
         }

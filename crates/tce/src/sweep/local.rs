@@ -10,6 +10,7 @@ use tce_base::{FileError, Progress, interrupted};
 
 use super::{Entry, Sweep};
 use crate::error::{Error, Result};
+use crate::processor::Processor;
 
 /// How to share the machine.
 #[derive(Clone, Copy, Debug)]
@@ -22,6 +23,8 @@ pub struct Share {
     pub retries: usize,
     /// Seconds between checkpoints.
     pub save_every: f64,
+    /// What computes the networks.
+    pub processor: Processor,
 }
 
 impl Sweep {
@@ -93,6 +96,7 @@ impl Sweep {
         let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let mut command = Command::new(program);
         command.args(["--threads", &share.threads.to_string(), "--save-every", &share.save_every.to_string()]);
+        command.args(["--device", &share.processor.to_string()]);
         command.args(["sweep", "run-one"]).arg(&self.directory).arg(entry.index.to_string());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
         // A signal to the terminal's group would reach the workers twice, and a second one ends them at once.

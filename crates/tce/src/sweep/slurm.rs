@@ -16,6 +16,7 @@ use tce_base::{sha256_hex, write_atomically};
 
 use super::{Kind, Sweep};
 use crate::error::{Error, Result};
+use crate::processor::Processor;
 use crate::stage::Owner;
 
 /// How to submit.
@@ -27,6 +28,8 @@ pub struct Submission {
     pub threads: usize,
     /// Seconds between checkpoints.
     pub save_every: f64,
+    /// What computes the networks.
+    pub processor: Processor,
     /// Seconds before the time limit at which the work is warned and writes its checkpoint.
     pub grace: u32,
     /// Further arguments of `sbatch`: partition, time limit, memory, account.
@@ -79,7 +82,7 @@ fn script(sweep: &Path, list: &Path, program: &Path, options: &Submission) -> St
         r#"#!/bin/sh
 # Written by `tce sweep launch`. Element N of the array does the work in line N of the list.
 work=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" {list})
-{program} --threads {threads} --save-every {save_every} sweep run-one {sweep} $work &
+{program} --threads {threads} --save-every {save_every} --device {processor} sweep run-one {sweep} $work &
 run=$!
 warned=0
 trap 'warned=1; kill -USR1 $run 2>/dev/null' USR1
@@ -102,6 +105,7 @@ exit $code
         sweep = quoted(sweep),
         threads = options.threads,
         save_every = options.save_every,
+        processor = options.processor,
     )
 }
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 use tce_base::{FileError, link_first, read_if_there, sha256_file, write_json};
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
 use crate::PROGRAM;
@@ -168,12 +168,12 @@ impl Sweep {
     ///
     /// # Errors
     /// What went wrong, which is also kept in `failed/`; if a copy of the work came to another result before.
-    pub fn work(&self, entry: &Entry) -> Result<Outcome> {
+    pub fn work(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
         if let Some(outcome) = self.outcome(entry)? {
             return Ok(outcome);
         }
         let beat = Heartbeat::start(self.file("active", &format!("{}.{}.json", entry.id, Owner::this())))?;
-        let outcome = self.compute(entry).and_then(|outcome| self.settle(outcome));
+        let outcome = self.compute(entry, device).and_then(|outcome| self.settle(outcome));
         drop(beat);
         let failed = self.file("failed", &format!("{}.json", entry.id));
         match &outcome {
@@ -184,7 +184,7 @@ impl Sweep {
         outcome
     }
 
-    fn compute(&self, entry: &Entry) -> Result<Outcome> {
+    fn compute(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
         let started = Instant::now();
         forget_peak_memory();
         let config = self.manifest.config(entry)?;
@@ -197,8 +197,8 @@ impl Sweep {
             Kind::Expand => {
                 let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let stage = match config.mixture.generated {
-                    GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, &cpu())?.1,
-                    _ => expand(&inputs, &config, seeds, root, &cpu())?.stage,
+                    GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, device)?.1,
+                    _ => expand(&inputs, &config, seeds, root, device)?.stage,
                 };
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
             }
@@ -211,7 +211,7 @@ impl Sweep {
             Kind::Run => {
                 let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let name = entry.column().replace(' ', "-");
-                let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), &cpu())?;
+                let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), device)?;
                 (summary.scores.first().copied().flatten(), summary.directory.clone(), files_of(&summary.directory)?)
             }
         };

@@ -7,7 +7,7 @@ use tce_data::{Standardizer, Task};
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
 use crate::error::Result;
@@ -113,7 +113,7 @@ fn sampler_name(sampler: &Sampler) -> String {
 
 impl GeneratorArgs {
     /// Runs the subcommand.
-    pub fn run(self, output: Output) -> Result<()> {
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
         let config = self.config.layered(Some(self.task), None)?.config()?;
         let inputs =
             Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows);
@@ -121,9 +121,8 @@ impl GeneratorArgs {
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
         let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };
         let training = &inputs.target.rows;
-        let device = cpu();
         let seeds = [self.seed];
-        let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.data.out, &device)?;
+        let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.data.out, device)?;
         let place = (self.task.agent, self.task.shift);
 
         let processes = match self.only {
@@ -138,7 +137,7 @@ impl GeneratorArgs {
         let mut floors = None;
         for process in processes {
             let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
-            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.data.out, &device)?;
+            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.data.out, device)?;
             let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
             if floors.is_none() {
                 let units = &generator.units;

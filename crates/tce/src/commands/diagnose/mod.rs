@@ -8,7 +8,7 @@ use tce_base::{FileError, read_if_there, write_atomically};
 use tce_data::Task;
 use tce_diagnosis::{AtBound, Diagnosis, Spread};
 use tce_learn::TransitionConfig;
-use tce_nn::cpu;
+use tce_nn::Device;
 
 use crate::config::Config;
 use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
@@ -88,10 +88,10 @@ struct RunArgs {
 
 impl Diagnose {
     /// Runs the command.
-    pub fn run(self, output: Output) -> Result<()> {
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
         match self.part {
-            Some(Part::Generator(args)) => args.run(output),
-            None => self.run.run(output),
+            Some(Part::Generator(args)) => args.run(output, device),
+            None => self.run.run(output, device),
         }
     }
 }
@@ -166,7 +166,7 @@ impl Finished {
 }
 
 impl RunArgs {
-    fn run(self, output: Output) -> Result<()> {
+    fn run(self, output: Output, device: &Device) -> Result<()> {
         if let Some(y) = self.y_max.iter().find(|y| !(0.0..=1.0).contains(*y)) {
             return Err(Error::Usage(format!("--y-max {y}: expected label bounds from 0 to 1")));
         }
@@ -194,7 +194,6 @@ impl RunArgs {
             value_steps: self.value_steps,
             abundant: self.abundant,
         };
-        let device = cpu();
         let (diagnosis, place) = match &self.run {
             Some(directory) => {
                 let run = Finished::read(directory)?;
@@ -224,7 +223,7 @@ impl RunArgs {
                     seeds: &run.seeds,
                     seed,
                 };
-                diagnose(&subject, &options, &root, &device)?
+                diagnose(&subject, &options, &root, device)?
             }
             None => {
                 let config = self.config.layered(None, Some(Variant::TceOg))?.config()?;
@@ -239,7 +238,7 @@ impl RunArgs {
                     seeds: &[seed],
                     seed,
                 };
-                diagnose(&subject, &options, &self.out.unwrap_or_else(|| "runs".into()), &device)?
+                diagnose(&subject, &options, &self.out.unwrap_or_else(|| "runs".into()), device)?
             }
         };
         let page = place.join("diagnosis.html");
