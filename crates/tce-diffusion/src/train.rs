@@ -168,22 +168,25 @@ impl Trainer {
             let whole = count == 0;
             let stop = interrupted() || self.stop.load(Ordering::Relaxed);
             if whole && self.step > 0 && (stop || checkpoints.due()) {
-                checkpoints.keep(self.step, self.state()).map_err(NetworkError::from)?;
+                checkpoints.keep(self.step, on_threads_of(&device, || self.state())).map_err(NetworkError::from)?;
             }
             if stop && whole {
                 let label = format!("training of {}", self.name);
                 return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
             }
-            let loss = on_threads_of(&device, || self.step(data, steps));
-            sum = Some(match sum {
-                None => loss,
-                Some(sum) => sum + loss,
-            });
+            let so_far = sum.take();
+            sum = Some(on_threads_of(&device, || {
+                let loss = self.step(data, steps);
+                match so_far {
+                    None => loss,
+                    Some(sum) => sum + loss,
+                }
+            }));
             count += 1;
             progress.inc(1);
             if self.step.is_multiple_of(REPORT) || self.step == steps {
-                let losses =
-                    host(sum.take().expect("at least one step")).iter().map(|l| l / count as f32).collect::<Vec<_>>();
+                let sum = sum.take().expect("at least one step");
+                let losses: Vec<_> = on_threads_of(&device, || host(sum)).iter().map(|l| l / count as f32).collect();
                 count = 0;
                 if let Some(member) = losses.iter().position(|l| !l.is_finite()) {
                     let (label, loss) = (format!("training of {}", self.name), losses[member]);

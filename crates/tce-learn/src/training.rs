@@ -425,10 +425,14 @@ impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
         own.tensors.extend(tensors);
         let metadata = state.metadata.iter();
         own.metadata.extend(metadata.filter_map(|(n, v)| Some((n.strip_prefix(&prefix)?.to_owned(), v.clone()))));
-        let meter = own.metadata.remove("meter").and_then(|text| serde_json::from_str(&text).ok());
+        // Until November 2026 there was no history.
+        let figures = |text: String| {
+            serde_json::from_str(&text).ok().or_else(|| Some((serde_json::from_str(&text).ok()?, Vec::new())))
+        };
+        let meter = own.metadata.remove("meter").and_then(figures);
         (self.meter, self.history) = meter.ok_or_else(|| NetworkError::Format {
             path: path.to_owned(),
-            reason: format!("no figures of lane {k}: no checkpoint of this training"),
+            reason: format!("no figures of lane {k}, so no checkpoint of this training; remove it to begin anew"),
         })?;
         self.lane.learner.restore(&own, path)
     }

@@ -65,7 +65,7 @@ pub fn cpu() -> Device {
     Device::flex()
 }
 
-/// The first GPU that Vulkan offers, without autodiff; a software driver where there is nothing better.
+/// The first GPU that Vulkan offers, without autodiff. A software driver counts as one, but Mesa's crashes in burn's matrix products.
 ///
 /// # Errors
 /// If there is none, or the program was built without the feature `vulkan`.

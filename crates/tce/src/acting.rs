@@ -252,6 +252,10 @@ impl Training {
         let lock = lock(directory)?;
         let path = directory.join("settings.json");
         let ledger = Ledger::newest_whole(directory)?;
+        if let Some(ledger) = &ledger {
+            // A training that is done makes no further checkpoint, and so would keep what a program killed at its end left.
+            tidy(directory, &ledger.files);
+        }
         if ledger.is_some() {
             let found: Settings = read_json(&path)?.ok_or_else(|| {
                 Error::Failed(format!("{}: missing, beside a checkpoint; restore the directory", path.display()))
@@ -454,16 +458,24 @@ impl Training {
             write_atomically(&self.directory.join("previous.json"), &bytes)?;
         }
         write_json(&self.directory.join("ledger.json"), &self.ledger)?;
-        // Older checkpoints, and what a killed program left, cost space only.
-        for entry in std::fs::read_dir(&self.directory).into_iter().flatten().flatten() {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            let ours = name.starts_with("replay-") || name.starts_with("learner-") || name.ends_with(".part");
-            if ours && self.ledger.files.iter().chain(&before).all(|(kept, _)| *kept != name) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
+        tidy(&self.directory, &before);
         self.saved = step;
         Ok(())
+    }
+}
+
+/// Removes older checkpoints than the two of the ledgers and `kept`, and what a killed program left half-written: they cost space
+/// only. Nothing is removed while a ledger cannot be read.
+fn tidy(directory: &Path, kept: &[(String, String)]) {
+    let ledger = |name: &str| read_json::<Ledger>(&directory.join(name));
+    let (Ok(last), Ok(previous)) = (ledger("ledger.json"), ledger("previous.json")) else { return };
+    let known: Vec<_> = last.iter().chain(&previous).flat_map(|l| &l.files).chain(kept).collect();
+    for entry in std::fs::read_dir(directory).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let ours = name.starts_with("replay-") || name.starts_with("learner-") || name.ends_with(".part");
+        if ours && known.iter().all(|(file, _)| *file != name) {
+            let _ = std::fs::remove_file(entry.path());
+        }
     }
 }
 

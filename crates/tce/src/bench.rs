@@ -23,7 +23,7 @@ use tce_learn::{
     Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
     MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
-use tce_nn::{Checkpoints, Device, is_cpu, product_rate, tensor};
+use tce_nn::{Checkpoints, Device, is_cpu, on_threads_of, product_rate, tensor};
 use tce_sim::{CollectOptions, UniformActor, collect};
 
 use crate::config::Algorithm;
@@ -60,7 +60,7 @@ type Workload = (&'static str, &'static str, fn(&On) -> Body);
 pub struct On {
     /// The device of the networks.
     pub device: Device,
-    /// Seeds of each learner.
+    /// Seeds of IQL and of the learners on its networks.
     pub seeds: u64,
 }
 
@@ -132,7 +132,7 @@ pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Meas
     let mut call = || {
         (body.call)();
         // A GPU works behind the program's back.
-        on.device.sync().expect("a device that works");
+        on_threads_of(&on.device, || on.device.sync()).expect("a device that works");
     };
     call();
     let threads = rayon::current_num_threads() as f64;

@@ -57,7 +57,8 @@ pub fn label_models(
     let by_rule = config.terminal == Terminal::Rule && inputs.agent.is_some();
     let learn_terminals = config.terminal != Terminal::None && !by_rule;
     let labels = LabelConfig { learn_terminals, ..config.training.clone() };
-    let stage = Stage::open(root, "stages/labels", &Spec { inputs: inputs.spec(false), seeds, labels: &labels })?;
+    let stage =
+        Stage::open(root, "stages/labels", &Spec { inputs: inputs.spec(false), seeds, labels: &labels }, device)?;
     let target = Arc::new(inputs.target.rows.clone());
     let member = |&seed: &u64| Member {
         streams: Streams::new(seed),
@@ -211,7 +212,7 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         filter: &config.filter,
         terminal: config.labels.terminal,
     };
-    let stage = Stage::open(root, "stages/generated", &spec)?;
+    let stage = Stage::open(root, "stages/generated", &spec, device)?;
     let (reports, tables) = match stage.summary::<Vec<Generated>>()? {
         Some(reports) => {
             let read = |g: &Generated| Ok(Arc::new(load(&stage.file(&g.file), &LoadOptions::default())?.transitions));

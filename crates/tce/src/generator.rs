@@ -13,7 +13,7 @@ use tce_diffusion::{
     Chunks, Condition, DiffusionError, NetworkConfig, Part, Process, Request, Sampler, Schedule, ScoreData, ScoreModel,
     Target, TrainConfig, Trainer, uniform_labels,
 };
-use tce_nn::{Checkpoints, Device};
+use tce_nn::{Checkpoints, Device, is_cpu};
 
 use crate::config::GeneratorConfig;
 use crate::error::{Error, Result};
@@ -86,7 +86,7 @@ impl Generator {
             balanced: g.balanced,
             source_states: g.source_states,
         };
-        let stage = Stage::open(root, "stages/networks", &spec)?;
+        let stage = Stage::open(root, "stages/networks", &spec, device)?;
         let files = ["state.safetensors", "transition.safetensors"];
         if let Some(trained) = stage.summary::<Trained>()? {
             let [state, transition] = files.map(|f| stage.file(f));
@@ -150,7 +150,8 @@ impl Generator {
             let steps = g.transition_steps;
             run(&mut transition, &transition_data, steps, &mut kept_transition, &metrics, "transition")
         };
-        let (state_loss, transition_loss) = if rayon::current_num_threads() > 1 {
+        // A GPU has one thread that queues for it.
+        let (state_loss, transition_loss) = if is_cpu(device) && rayon::current_num_threads() > 1 {
             std::thread::scope(|scope| {
                 let other = scope.spawn(transition_run);
                 let state_loss = state_run();

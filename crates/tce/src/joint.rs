@@ -29,7 +29,7 @@ use tce_diffusion::{
     Chunks, Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
     uniform_labels,
 };
-use tce_nn::{Device, NamedParameters};
+use tce_nn::{Device, NamedParameters, cpu};
 
 use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig, ScoreDraw};
 use crate::error::{Error, Result};
@@ -218,7 +218,7 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
         options: &'a DensityOptions,
     }
     let file = "scores.safetensors";
-    let stage = Stage::open(root, "stages/scores", &Spec { inputs: inputs.spec(true), options })?;
+    let stage = Stage::open(root, "stages/scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
     if let Some(scale) = stage.summary::<DensityScale>()? {
         let path = stage.file(file);
         let mut loaded = NamedParameters::load(&path)?;
@@ -280,7 +280,7 @@ fn train(
         scores: scored.map(|_| &j.scores),
     };
     let file = "joint.safetensors";
-    let stage = Stage::open(root, "stages/joint", &spec)?;
+    let stage = Stage::open(root, "stages/joint", &spec, device)?;
     if let Some(trained) = stage.summary::<Trained>()? {
         return Ok((ScoreModel::load(&stage.file(file), device)?, trained, stage));
     }
@@ -341,7 +341,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     let (model, trained, network) = train(inputs, kind, j, scored.as_ref(), seeds, root, device)?;
     let guidance = scored.as_ref().map(|_| j.guidance.clone());
     let spec = Spec { network: network.name(), sampler: j.sampler, rows: j.rows, guidance };
-    let stage = Stage::open(root, "stages/generated", &spec)?;
+    let stage = Stage::open(root, "stages/generated", &spec, device)?;
     if let Some(reports) = stage.summary::<Vec<Generated>>()? {
         return read(stage, reports, scored.is_some());
     }

@@ -19,7 +19,7 @@ use crate::actors::{Arena, Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
 use crate::methods::build;
-use crate::metrics::Metrics;
+use crate::metrics::{Line, Metrics};
 use crate::processor::Processor;
 use crate::units::even_standardizer;
 
@@ -60,7 +60,7 @@ impl Learned {
 }
 
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
-/// policy is the same. Metrics and checkpoints are kept in a directory, beside a word that stands for all that decides the result. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
+/// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a word that stands for all that decides the result. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
 /// whatever happens then.
 pub fn learn(
     data: Vec<MemberData>,
@@ -89,20 +89,19 @@ pub fn learn(
     let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
-    // What was trained before the first step is told anew as long as there is no later checkpoint, and whole in any case.
-    let metrics = &mut Metrics::resume(directory, |stage, at| {
-        from > 0 && (at <= from || !["learn", "evaluate"].contains(&stage))
+    // What was trained before the first step is told whole at every start.
+    let before = journal.take();
+    let before = before.iter().flat_map(|(lane, training, report)| lines(training, report, lane * size)).collect();
+    let metrics = &mut Metrics::resume_behind(directory, before, |stage, at| {
+        at <= from && ["learn", "evaluate"].contains(&stage)
     })?;
-    if from == 0 {
-        for (lane, training, report) in journal.take() {
-            log(metrics, &training, &report, lane * size)?;
-        }
-    }
     // The number of the last evaluation, which came with the last report.
     let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
     let mut judged = vec![number(from - from % steps.report_every); lanes.len()];
     let outcome = train_side_by_side(&mut lanes, steps, &label, &mut checkpoints, device, |k, report, learner| {
-        log(metrics, "learn", report, k * size)?;
+        for line in lines("learn", report, k * size) {
+            metrics.write(&line)?;
+        }
         for (name, values) in &report.metrics {
             let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![None; seeds.len()]);
             for (figure, value) in figures[k * size..].iter_mut().zip(values) {
@@ -136,13 +135,11 @@ pub fn learn(
     Ok(learned)
 }
 
-/// Logs a report of `stage` on members `first` and following.
-fn log(metrics: &mut Metrics, stage: &str, report: &Report, first: usize) -> Result<()> {
+/// A report of `stage` on members `first` and following.
+fn lines<'a>(stage: &'a str, report: &'a Report, first: usize) -> impl Iterator<Item = Line> + use<'a> {
     let members = report.metrics.values().map(Vec::len).max().unwrap_or(0);
-    for m in 0..members {
-        metrics.log(stage, report.step, first + m, report.metrics.iter().map(|(name, v)| (name.as_str(), v[m])))?;
-    }
-    Ok(())
+    let figures = move |m| report.metrics.iter().map(move |(name, v): (&String, &Vec<f64>)| (name.as_str(), v[m]));
+    (0..members).map(move |m| Line::new(stage, report.step, first + m, figures(m)))
 }
 
 /// The members of `data` as one training, before its first step.

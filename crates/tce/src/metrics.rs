@@ -21,13 +21,24 @@ impl Metrics {
     /// Starts `metrics.jsonl` and `tensorboard/` in `directory`, or goes on with what is there, without the lines for
     /// whose stage and step `keep` is false: a killed program may have written more than its checkpoint knows.
     pub fn resume(directory: &Path, keep: impl Fn(&str, u64) -> bool) -> Result<Self, FileError> {
+        Self::resume_behind(directory, Vec::new(), keep)
+    }
+
+    /// The same with `first` before what is kept, for what is known anew at every start.
+    pub fn resume_behind(
+        directory: &Path,
+        first: Vec<Line>,
+        keep: impl Fn(&str, u64) -> bool,
+    ) -> Result<Self, FileError> {
         fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let path = directory.join("metrics.jsonl");
         let old = read_if_there(&path)?.unwrap_or_default();
         let old = String::from_utf8_lossy(&old);
         // The last line may be half written.
         let lines = old.lines().filter_map(|line| Some((line, serde_json::from_str::<Line>(line).ok()?)));
-        let kept: Vec<_> = lines.filter(|(_, line)| keep(&line.stage, line.step)).collect();
+        let first = first.into_iter().map(|line| (line.text(), line));
+        let kept = lines.filter(|(_, line)| keep(&line.stage, line.step)).map(|(text, line)| (text.to_owned(), line));
+        let kept: Vec<_> = first.chain(kept).collect();
         let text: String = kept.iter().map(|(line, _)| format!("{line}\n")).collect();
         write_atomically(&path, text.as_bytes())?;
         let file = OpenOptions::new().append(true).open(&path).map_err(|e| FileError::new(&path, "open", e))?;
@@ -40,8 +51,7 @@ impl Metrics {
         }
         let mut metrics = Self { path, lines: BufWriter::new(file), events_root, events: Vec::new() };
         for (_, line) in kept {
-            let values = line.values.iter().map(|(name, v)| (name.as_str(), v.as_f64().unwrap_or(f64::NAN)));
-            metrics.scalars(&line.stage, line.step, line.member, &values.collect::<Vec<_>>())?;
+            metrics.scalars(&line)?;
         }
         Ok(metrics)
     }
@@ -54,32 +64,48 @@ impl Metrics {
         member: usize,
         values: impl IntoIterator<Item = (&'a str, f64)>,
     ) -> Result<(), FileError> {
-        let values: Vec<_> = values.into_iter().collect();
-        let map = values.iter().map(|&(name, value)| (name.to_owned(), Value::from(value))).collect();
-        let line = Line { stage: stage.into(), step, member, values: map };
-        let failed = |e| FileError::new(&self.path, "write", e);
-        let text = serde_json::to_value(&line).expect("plain data");
-        writeln!(self.lines, "{text}").and_then(|()| self.lines.flush()).map_err(failed)?;
-        self.scalars(stage, step, member, &values)
+        self.write(&Line::new(stage, step, member, values))
     }
 
-    fn scalars(&mut self, stage: &str, step: u64, member: usize, values: &[(&str, f64)]) -> Result<(), FileError> {
-        while self.events.len() <= member {
+    /// Records a line.
+    pub fn write(&mut self, line: &Line) -> Result<(), FileError> {
+        let failed = |e| FileError::new(&self.path, "write", e);
+        writeln!(self.lines, "{}", line.text()).and_then(|()| self.lines.flush()).map_err(failed)?;
+        self.scalars(line)
+    }
+
+    fn scalars(&mut self, line: &Line) -> Result<(), FileError> {
+        while self.events.len() <= line.member {
             let directory = self.events_root.join(format!("member-{}", self.events.len()));
             self.events.push(Events::create(&directory)?);
         }
-        self.events[member].scalars(step, values.iter().map(|&(name, value)| (format!("{stage}/{name}"), value)))
+        // What is not finite is no number in JSON.
+        let value = |v: &Value| v.as_f64().unwrap_or(f64::NAN);
+        let values = line.values.iter().map(|(name, v)| (format!("{}/{name}", line.stage), value(v)));
+        self.events[line.member].scalars(line.step, values)
     }
 }
 
 /// One line of `metrics.jsonl`.
 #[derive(Serialize, Deserialize)]
-struct Line {
+pub struct Line {
     stage: String,
     step: u64,
     member: usize,
     #[serde(flatten)]
     values: Map<String, Value>,
+}
+
+impl Line {
+    /// `values` of `member` of the population after `step` steps of `stage`.
+    pub fn new<'a>(stage: &str, step: u64, member: usize, values: impl IntoIterator<Item = (&'a str, f64)>) -> Self {
+        let values = values.into_iter().map(|(name, value)| (name.to_owned(), Value::from(value))).collect();
+        Self { stage: stage.into(), step, member, values }
+    }
+
+    fn text(&self) -> String {
+        serde_json::to_value(self).expect("plain data").to_string()
+    }
 }
 
 /// A TensorBoard event file: TFRecord frames around `Event` protocol buffers, of which scalars need five fields.

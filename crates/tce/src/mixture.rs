@@ -20,7 +20,7 @@ use tce_data::{
     NeighbourOptions, Rows, Transitions, TransportOptions, lambda_quantile_select, nn_distances, transport_costs,
 };
 use tce_learn::{LabelModels, TerminalHandling};
-use tce_nn::NamedParameters;
+use tce_nn::{NamedParameters, cpu};
 
 use crate::config::{MixtureConfig, SourceRows};
 use crate::error::{Error, Result};
@@ -127,7 +127,7 @@ pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f
 
 /// [`distances`], and the directory where they are.
 pub fn distances_stage(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<(Vec<f32>, PathBuf)> {
-    let stage = Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(true), kind })?;
+    let stage = Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(true), kind }, &cpu())?;
     let file = stage.file("distances.safetensors");
     if stage.summary::<usize>()?.is_some() {
         let mut loaded = NamedParameters::load(&file)?;

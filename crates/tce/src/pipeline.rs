@@ -132,7 +132,7 @@ pub fn run(
         labels: (two_stages || relabelled).then_some(&config.labels),
         joint: config.joint.used(config.mixture.generated, config.learner.algorithm),
     };
-    let stage = Stage::open(root, &format!("{place}/{name}"), &spec)?;
+    let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
     if let Some(summary) = stage.summary::<Summary>()? {
         eprintln!("{name}: done before, in {}", stage.directory().display());
         return Ok(summary);

@@ -21,6 +21,13 @@ pub enum Processor {
 }
 
 impl Processor {
+    /// Adds the device to what decides a result, unless it is the CPU.
+    pub fn sign(self, spec: &mut serde_json::Value) {
+        if self != Self::Cpu {
+            spec["device"] = self.to_string().into();
+        }
+    }
+
     /// The device, without autodiff.
     ///
     /// # Errors

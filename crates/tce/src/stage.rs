@@ -18,11 +18,12 @@ use std::time::SystemTime;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use tce_base::{FileError, link_first, read_if_there, sha256_file, sha256_hex, write_json};
-use tce_nn::Checkpoints;
+use tce_nn::{Checkpoints, Device};
 
 use crate::PROGRAM;
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
+use crate::processor::Processor;
 
 /// Changes when the same specification would give other bytes.
 const FORMAT: u32 = 2;
@@ -50,9 +51,11 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// The stage `name` for `spec` under `root`. The specification is kept beside the results.
-    pub fn open<S: Serialize>(root: &Path, name: &str, spec: &S) -> Result<Self> {
-        let spec = serde_json::json!({ "format": FORMAT, "stage": name.rsplit('/').next(), "spec": spec });
+    /// The stage `name` for `spec` under `root`. The specification is kept beside the results. What another device than the CPU
+    /// computes is a stage of its own: it has other bytes.
+    pub fn open<S: Serialize>(root: &Path, name: &str, spec: &S, device: &Device) -> Result<Self> {
+        let mut spec = serde_json::json!({ "format": FORMAT, "stage": name.rsplit('/').next(), "spec": spec });
+        Processor::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let directory = root.join(format!("{name}-{}", &key[..12]));
         fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
@@ -360,7 +363,7 @@ mod tests {
     use super::*;
 
     fn stage(root: &Path, spec: u32) -> Stage {
-        Stage::open(root, "stages/test", &("spec", spec)).unwrap()
+        Stage::open(root, "stages/test", &("spec", spec), &tce_nn::cpu()).unwrap()
     }
 
     fn make(attempt: Attempt, content: &[u8]) -> Result<()> {

@@ -26,7 +26,7 @@ pub struct Bench {
     /// Seconds a repeat takes.
     #[arg(long, default_value_t = 0.5)]
     seconds: f64,
-    /// Seeds of each learner (iql, iql-kl, and the methods); every member's update counts.
+    /// Seeds of IQL and of the learners on its networks (iql, iql-kl, dara ... rebrac); every member's update counts.
     #[arg(long, default_value_t = 1)]
     seeds: u64,
     /// Write the results to this file as JSON, too.
@@ -87,7 +87,7 @@ impl Bench {
             instructions: tce_nn::instructions(),
             threads: rayon::current_num_threads(),
             core_gflops,
-            whole_task: whole_task(&workloads)?,
+            whole_task: if kind == Processor::Cpu && self.seeds == 1 { whole_task(&workloads)? } else { None },
             workloads,
         };
         if let Some(path) = &self.out {
@@ -128,12 +128,14 @@ fn render(report: &Report) -> String {
     let rows = report.workloads.iter().map(|m| {
         let number = |x: f64| if x >= 1000.0 { format!("{x:.0}") } else { format!("{x:.1}") };
         let products = |text: String| if m.gflops > 0.0 { text } else { "-".into() };
+        // The CPU's rate is no measure of a GPU.
+        let share = if report.device == Processor::Cpu { format!("{:.0} %", 100.0 * m.share) } else { "-".into() };
         [
             m.name.to_owned(),
             format!("{} {}/s", number(m.per_second), m.unit),
             format!("{} .. {}", number(m.range[0]), number(m.range[1])),
             products(format!("{:.1}", m.gflops)),
-            products(format!("{:.0} %", 100.0 * m.share)),
+            products(share),
         ]
     });
     let header = ["workload", "rate", "range", "GFLOP/s", "of the cores' own"];

@@ -18,6 +18,7 @@ use crate::learning::{Learned, MemberData, learn};
 use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
+use crate::processor::Processor;
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -105,10 +106,11 @@ impl Learn {
             trajectories: vec![target.clone()],
         };
         let data = seeds.iter().map(member).collect();
-        let spec = serde_json::json!({
+        let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
             "target": sha256_file(&target_file)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
         });
+        Processor::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;

@@ -91,22 +91,23 @@ impl Cli {
             return Err(Error::Usage(format!("--save-every {}: expected a number of seconds", self.save_every)));
         }
         tce_nn::set_checkpoint_seconds(self.save_every);
-        let device = self.device.device()?;
+        // Opened by the commands that compute networks; the others need none.
+        let device = || self.device.device();
         let output = Output { json: self.json };
         match self.command {
-            Command::Run(args) => args.run(output, &device),
-            Command::Augment(args) => args.run(output, &device),
-            Command::Learn(args) => args.run(output, &device),
+            Command::Run(args) => args.run(output, &device()?),
+            Command::Augment(args) => args.run(output, &device()?),
+            Command::Learn(args) => args.run(output, &device()?),
             Command::Evaluate(args) => args.run(output),
-            Command::TrainSac(args) => args.run(output, &device),
+            Command::TrainSac(args) => args.run(output, &device()?),
             Command::Zoo(command) => command.run(output),
             Command::Collect(args) => args.run(output),
             Command::Data(command) => command.run(output),
             Command::Config(command) => command.run(output),
-            Command::Diagnose(command) => command.run(output, &device),
-            Command::Sweep(command) => command.run(output, self.save_every, (self.device, &device)),
+            Command::Diagnose(command) => command.run(output, &device()?),
+            Command::Sweep(command) => command.run(output, self.save_every, self.device),
             Command::Report(args) => args.run(output),
-            Command::Bench(args) => args.run(output, self.device, &device),
+            Command::Bench(args) => args.run(output, self.device, &device()?),
         }
     }
 }

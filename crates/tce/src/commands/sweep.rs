@@ -119,11 +119,11 @@ pub struct Gather {
 
 impl SweepCommand {
     /// Runs the command.
-    pub fn run(self, output: Output, save_every: f64, (processor, device): (Processor, &Device)) -> Result<()> {
+    pub fn run(self, output: Output, save_every: f64, processor: Processor) -> Result<()> {
         match self {
             SweepCommand::Plan(args) => args.run(output),
             SweepCommand::Launch(args) => args.run(output, save_every, processor),
-            SweepCommand::RunOne(args) => args.run(output, device),
+            SweepCommand::RunOne(args) => args.run(output, &processor.device()?),
             SweepCommand::Status(args) => args.run(output),
             SweepCommand::Gather(args) => args.run(output),
         }
@@ -214,7 +214,9 @@ impl Launch {
             }
             Launcher::Local => {
                 let cores = std::thread::available_parallelism().map_or(1, usize::from);
-                let workers = self.workers.unwrap_or((cores / self.threads_each).max(1));
+                // Several programs on one GPU take each other's time.
+                let fitting = if processor == Processor::Cpu { (cores / self.threads_each).max(1) } else { 1 };
+                let workers = self.workers.unwrap_or(fitting);
                 let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every, processor };
                 let failed = sweep.launch_here(share)?;
                 let status = sweep.status()?;

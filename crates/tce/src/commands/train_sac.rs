@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use tce_data::{Agent, Shift, parse_environment, save_d4rl};
 use tce_learn::sac::SacConfig;
-use tce_nn::Device;
+use tce_nn::{Device, on_threads_of};
 
 use crate::acting::{Goal, Ledger, Settings, Training};
 use crate::error::{Error, Result};
@@ -121,10 +121,12 @@ impl TrainSac {
         let before: Vec<u64> = trainings.iter().map(|t| t.3.ledger().step).collect();
         // A training that fails does not take the others with it.
         while trainings.iter().zip(&faults).any(|(t, fault)| fault.is_none() && !t.3.finished()) {
-            trainings.par_iter_mut().zip(&mut faults).for_each(|(t, fault)| {
-                if fault.is_none() {
-                    *fault = t.3.advance(TURN).err();
-                }
+            on_threads_of(device, || {
+                trainings.par_iter_mut().zip(&mut faults).for_each(|(t, fault)| {
+                    if fault.is_none() {
+                        *fault = t.3.advance(TURN).err();
+                    }
+                });
             });
         }
         let seconds = started.elapsed().as_secs_f64();

@@ -152,7 +152,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         seed,
         options,
     };
-    let stage = Stage::open(root, "stages/diagnosis", &spec)?;
+    let stage = Stage::open(root, "stages/diagnosis", &spec, device)?;
     let file = "diagnosis.json".to_owned();
     if stage.summary::<serde_json::Value>()?.is_some() {
         return Ok((read(&stage.file(&file))?, stage.directory().to_owned()));

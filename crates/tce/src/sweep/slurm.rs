@@ -240,3 +240,24 @@ fn unique() -> String {
     // Without the dots, behind which an extension would begin.
     format!("{}-{}", Owner::this(), COUNT.fetch_add(1, Ordering::Relaxed)).replace('.', "-")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_script_hands_on_how_the_work_is_to_be_done() {
+        let options = Submission {
+            pack: 1,
+            threads: 3,
+            save_every: 20.0,
+            processor: Processor::Vulkan,
+            grace: 60,
+            arguments: vec![],
+            dry_run: false,
+        };
+        let text = script(Path::new("/it's here"), Path::new("/list"), Path::new("/bin/tce"), &options);
+        let call = r"'/bin/tce' --threads 3 --save-every 20 --device vulkan sweep run-one '/it'\''s here' $work &";
+        assert!(text.lines().any(|line| line == call), "{text}");
+    }
+}
