@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! ρ(x)     = ln D(x → tar) − ln D(x → src)       D = d² (faiss gives squares) or d, d the L2 distance to the k-th neighbour
-//! score(x) = 1 / (1 + ρ(x) − min ρ)              min over all source and target rows; 1: the most target-like row there is
+//! score(x) = 1 / (1 + ρ(x) − min ρ)              min over the source rows; 1: the most target-like source row
 //! ```
 //!
 //! | symbol | field | default | source |
@@ -14,7 +14,7 @@
 //!
 //! **A row and itself.** The published index answers a query with the row itself, at distance 0, where the row is part of the
 //! index: of a row's own set, index 4 is the 4th *other* row. So it is here: a source row is compared with its 4th other source
-//! row, a target row with its 4th other target row, whether or not the row was drawn into the reference.
+//! row, whether or not it was drawn into the reference.
 //!
 //! **Thinning.** With m of n source rows at random, the k-th neighbour lies about where the (k n / m)-th lay: in d dimensions
 //! ln d_k grows by ln(n / m) / d wherever the density is even over that distance. A constant cancels in ρ − min ρ.
@@ -47,7 +47,7 @@ impl Default for DensityOptions {
     }
 }
 
-/// What the scores of a pair of data sets have in common, and with it the scores of further rows.
+/// What the scores of source rows have in common, and with it the scores of further rows.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DensityScale {
@@ -59,18 +59,16 @@ pub struct DensityScale {
     pub source_floor: f32,
 }
 
-/// The scores of a pair of data sets.
+/// The scores of source rows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityScores {
-    /// Of the source rows, `[source.len()]`.
+    /// `[source.len()]`
     pub source: Vec<f32>,
-    /// Of the target rows, `[target.len()]`.
-    pub target: Vec<f32>,
     /// For [`further_scores`].
     pub scale: DensityScale,
 }
 
-/// The scores of all source and target rows (points [s, a, s'], in DmC, as stored).
+/// The scores of all source rows (points [s, a, s'], in DmC, as stored).
 ///
 /// The reference comes from the stream `density/reference`. Independent of the number of threads.
 ///
@@ -99,24 +97,19 @@ pub fn density_scores(
             own
         }
     };
-    let whole = reference.indices.is_none();
-    let points = if whole { source } else { &points };
-    let to_target = [nn_distances(source, target, &at(k))?, nn_distances(target, target, &at(k))?];
-    let to_source = [own, nn_distances(target, points, &at(k))?];
-    let mut scale = DensityScale { least: 0.0, target_floor: floor(&to_target), source_floor: floor(&to_source) };
-    let [of_source, of_target] =
-        [0, 1].map(|i| scale.ratios(&to_target[i], &to_source[i], options.squared).collect::<Vec<_>>());
-    let least = of_source.iter().chain(&of_target).copied().fold(f64::INFINITY, f64::min);
+    let to_target = nn_distances(source, target, &at(k))?;
+    let mut scale = DensityScale { least: 0.0, target_floor: floor(&to_target), source_floor: floor(&own) };
+    let ratios: Vec<f64> = scale.ratios(&to_target, &own, options.squared).collect();
+    let least = ratios.iter().copied().fold(f64::INFINITY, f64::min);
     scale.least = least as f32;
     if (scale.least as f64) < least {
         scale.least = scale.least.next_up();
     }
-    let scores = |ratios: Vec<f64>| ratios.into_iter().map(|rho| scale.score(rho)).collect();
-    Ok(DensityScores { source: scores(of_source), target: scores(of_target), scale })
+    Ok(DensityScores { source: ratios.into_iter().map(|rho| scale.score(rho)).collect(), scale })
 }
 
-/// The scores, on the `scale` of the pair, of rows that are in neither set: generated ones. A ρ below the pair's least counts as
-/// the least.
+/// The scores, on the `scale` of the source rows, of rows that are in neither set: generated ones. A ρ below the least counts as
+/// the least: these rows have score 1.
 ///
 /// # Errors
 /// [`DataError::Interrupted`].
@@ -144,8 +137,8 @@ fn at(k: usize) -> NeighbourOptions {
 }
 
 /// The smallest distance that is not 0; 1 where all are.
-fn floor(distances: &[Vec<f32>]) -> f32 {
-    let least = distances.iter().flatten().filter(|d| **d > 0.0).fold(f32::INFINITY, |a, &b| a.min(b));
+fn floor(distances: &[f32]) -> f32 {
+    let least = distances.iter().filter(|d| **d > 0.0).fold(f32::INFINITY, |a, &b| a.min(b));
     if least.is_finite() { least } else { 1.0 }
 }
 
@@ -212,16 +205,12 @@ mod tests {
         let (s, t) = (Rows::new(&source, 3), Rows::new(&target, 3));
         let (options, streams) = (DensityOptions::default(), Streams::new(0));
         let scores = density_scores(&s, &t, &options, &streams).unwrap();
-        let rho = [&source, &target].map(|rows| brute(rows, &source, &target, 3, 5));
-        let least = rho.iter().flatten().copied().fold(f64::INFINITY, f64::min);
-        for (scores, rho) in [&scores.source, &scores.target].iter().zip(&rho) {
-            for (score, rho) in scores.iter().zip(rho) {
-                assert!((*score as f64 - 1.0 / (1.0 + rho - least)).abs() < 1e-6, "{score} {rho}");
-            }
+        let rho = brute(&source, &source, &target, 3, 5);
+        let least = rho.iter().copied().fold(f64::INFINITY, f64::min);
+        for (score, rho) in scores.source.iter().zip(&rho) {
+            assert!((*score as f64 - 1.0 / (1.0 + rho - least)).abs() < 1e-6, "{score} {rho}");
         }
-        assert_eq!(scores.source.iter().chain(&scores.target).copied().fold(0.0, f32::max), 1.0);
-        let mean = |x: &[f32]| x.iter().sum::<f32>() / x.len() as f32;
-        assert!(mean(&scores.target) > mean(&scores.source));
+        assert_eq!(scores.source.iter().copied().fold(0.0, f32::max), 1.0);
 
         // Without squares ρ is half as large.
         let plain = DensityOptions { squared: false, ..options };
@@ -230,7 +219,7 @@ mod tests {
             assert!(((1.0 / a - 1.0) - 2.0 * (1.0 / b - 1.0)).abs() < 1e-4);
         }
 
-        // Further rows know no row that is themselves.
+        // Further rows know no row that is themselves; target-like ones are beyond the best source row, and count as it.
         let more = normal("more", 50, 3, 0.5, 1.0);
         let further = further_scores(&Rows::new(&more, 3), &s, &t, &scores.scale, &options, &streams).unwrap();
         for (score, rho) in further.iter().zip(brute(&more, &source, &target, 3, 5)) {
@@ -305,6 +294,6 @@ mod tests {
         let pool = |n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         let scores = pool(1).install(run);
         assert_eq!(scores, pool(2).install(run));
-        assert!(scores.source.iter().chain(&scores.target).all(|s| *s > 0.0 && *s <= 1.0));
+        assert!(scores.source.iter().all(|s| *s > 0.0 && *s <= 1.0));
     }
 }

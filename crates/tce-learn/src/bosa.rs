@@ -20,6 +20,9 @@
 //! | - | `critic_lr`, `hidden`, `actor` | 3e-4, 256-256 | ODRL |
 //! | - | `mode` | corrected | published: y = r + γ terminal min(Q1', Q2')(s', a') |
 //!
+//! s' is standardised here, without the dimensions that never change, where ODRL models it raw and whole. ln ε is then another bar: with β² = .125
+//! every dimension that is modelled perfectly adds .12 to ln p̂. In our runs the mask keeps 95 % of the rows (Ant) or more.
+//!
 //! **Published**: ODRL's buffer returns 1 - terminal, which its BOSA takes for terminal: it bootstraps at terminal rows and nowhere
 //! else, and the critics learn the immediate reward.
 

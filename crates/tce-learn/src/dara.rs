@@ -14,11 +14,11 @@
 //! | σ | `noise` | 1 | ODRL, on raw inputs; here on inputs as the networks see them |
 //! | - | `hidden` | 256, 256 ReLU | ODRL |
 //! | - | `lr` | 3e-4 | ODRL |
-//! | - | `mode` | corrected | published: CE takes p for logits (below) |
+//! | - | `mode` | corrected | published: p is a softmax of a softmax (below) |
 //!
-//! **Published**: ODRL's forward pass ends in a softmax, and cross-entropy, which has one of its own, is given its result: L_C
-//! is then between .31 and 1.31 for every row, and its gradient vanishes where the classifier is sure. Δ is computed from the
-//! first softmax in both modes.
+//! **Published**: ODRL's forward pass ends in a softmax, and both of its users take the result for logits. L_C is then between .31 and
+//! 1.31 for every row, with a gradient that vanishes where the classifier is sure; the log-odds of which Δ is the difference are a
+//! difference of probabilities, |Δ| ≤ 2: no source row loses more than 2 η, where the method means up to c η.
 
 use std::path::Path;
 
@@ -44,7 +44,7 @@ const TINY: f64 = 1e-10;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DaraConfig {
-    /// Which loss the classifiers get.
+    /// How often the classifiers' outputs go through a softmax.
     pub mode: Mode,
     /// η
     pub eta: f64,
@@ -119,23 +119,28 @@ impl Dara {
     }
 }
 
-/// Cross-entropy of `outputs` `[P, B, 2]` against the labels target (1) for the first `target_rows` rows and source (0) for the
-/// others, mean over rows. Published: of softmax(`outputs`), as if they were logits.
-pub fn domain_cross_entropy(outputs: Tensor<3>, target_rows: usize, mode: Mode) -> Tensor<3> {
-    let [_, b, _] = outputs.dims();
-    let logits = match mode {
+/// What a mode takes for the logits of a classifier with `outputs` `[P, B, 2]`. Published: their softmax.
+fn logits(outputs: Tensor<3>, mode: Mode) -> Tensor<3> {
+    match mode {
         Mode::Published => softmax(outputs, 2),
         Mode::Corrected => outputs,
-    };
-    let log_p = log_softmax(logits, 2);
+    }
+}
+
+/// Cross-entropy of `outputs` `[P, B, 2]` against the labels target (1) for the first `target_rows` rows and source (0) for the
+/// others, mean over rows.
+pub fn domain_cross_entropy(outputs: Tensor<3>, target_rows: usize, mode: Mode) -> Tensor<3> {
+    let [_, b, _] = outputs.dims();
+    let log_p = log_softmax(logits(outputs, mode), 2);
     let target = log_p.clone().narrow(1, 0, target_rows).narrow(2, 1, 1);
     let source = log_p.narrow(1, target_rows, b - target_rows).narrow(2, 0, 1);
     -member_mean(Tensor::cat(vec![target, source], 1))
 }
 
 /// Δ `[P, B, 1]` before clipping, from the outputs `[P, B, 2]` of the two classifiers.
-pub fn dynamics_gap(sas: Tensor<3>, sa: Tensor<3>) -> Tensor<3> {
+pub fn dynamics_gap(sas: Tensor<3>, sa: Tensor<3>, mode: Mode) -> Tensor<3> {
     let log_p = |outputs: Tensor<3>, k: usize| (softmax(outputs, 2).narrow(2, k, 1) + TINY).log();
+    let (sas, sa) = (logits(sas, mode), logits(sa, mode));
     log_p(sas.clone(), 1) - log_p(sa.clone(), 1) - log_p(sas, 0) + log_p(sa, 0)
 }
 
@@ -163,7 +168,7 @@ impl Shape for Classifiers {
         let (first, others) = (batch.target_rows, batch.s.dims()[1] - batch.target_rows);
         let (x, y) = join(batch);
         let source = |x: Tensor<3>| x.narrow(1, first, others);
-        let gap = dynamics_gap(sas.net().valid().forward(source(x)), sa.net().valid().forward(source(y)));
+        let gap = dynamics_gap(sas.net().valid().forward(source(x)), sa.net().valid().forward(source(y)), c.mode);
         let gap = gap.clamp(-c.clip, c.clip);
         meter.record("dynamics_gap", &gap);
         let r = Tensor::cat(vec![batch.r.clone().narrow(1, 0, first), source(batch.r.clone()) + gap * c.eta], 1);
@@ -217,9 +222,16 @@ mod tests {
     fn the_gap_is_the_difference_of_log_odds() {
         // With probabilities far from 0 the odds are the differences of the outputs.
         let sa = tensor(vec![0.2, 0.1, 0.0, 0.0, -1.0, 1.0], [1, 3, 2], &cpu());
-        let gap = host(dynamics_gap(outputs(), sa));
+        let gap = host(dynamics_gap(outputs(), sa.clone(), Mode::Corrected));
         for (gap, expected) in gap.iter().zip([3.0 + 0.1, -1.0, 1.0 - 2.0]) {
             assert!((gap - expected).abs() < 1e-5, "{gap} is not {expected}");
+        }
+        // Of probabilities taken for outputs: p_tar − p_src of either classifier.
+        let gap = host(dynamics_gap(outputs(), sa, Mode::Published));
+        let odds = |a: f64, b: f64| softmax2(a, b).1 - softmax2(a, b).0;
+        let expected = [odds(-1.0, 2.0) - odds(0.2, 0.1), odds(0.5, -0.5), odds(3.0, 4.0) - odds(-1.0, 1.0)];
+        for (gap, expected) in gap.iter().zip(expected) {
+            assert!((*gap as f64 - expected).abs() < 1e-5, "{gap} is not {expected}");
         }
     }
 }

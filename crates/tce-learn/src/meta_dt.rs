@@ -23,7 +23,7 @@
 //! | - | `world_model.steps` | 10 000 | ours; Meta-DT: 201 passes over its data |
 //! | - | `world_model.lr`, `.batch`, `.grad_clip` | 1e-3, 128, 1 | Meta-DT |
 //! | h | `world_model.horizon` | 8 | ours: as many steps as the transformer sees |
-//! | - | `world_model.features`, `.gru`, `.latent`, `.hidden` | 16, 128, 16, (128, 128) | Meta-DT |
+//! | - | `world_model.features`, `.gru`, `.latent`, `.hidden` | 16, 128, 16, (128, 128) | Meta-DT; its decoders see s and a through a layer of 16, ours as they are, and both for all robots |
 //!
 //! Rewards are used as they are: a buffer's `reward_scale` is for critics, and `return_scale` does its work here.
 

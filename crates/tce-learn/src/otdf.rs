@@ -15,10 +15,15 @@
 //! | - | `mode` | corrected | published: every row is cloned with the mean weight of its batch |
 //! | β and its CVAE | `learner.behaviour` | - | [`crate::regulariser`], kind `otdf` |
 //! | d | `row_scores` of a [`crate::Member`] | - | a number per source row |
-//! | everything else | `learner.iql` | - | OTDF's IQL is ours |
+//! | everything else | `learner.iql` | - | OTDF's IQL, but for what the preset changes in it (below) |
 //!
 //! **Published**: a column of weights times a row of losses, in other words filtered cloning with a regulariser: the advantages have
 //! no effect on which action is cloned ([`PolicyExtraction::MeanWeight`]).
+//!
+//! **β_reg is relative to the weights of cloning.** OTDF has min(exp(3 u), 100) of raw advantages: a tenth of them at 100 on HalfCheetah, so 10 or
+//! more on average. The preset `default` has exp(u / std u), 1.2 to 1.5 on average, and there the same β_reg holds the policy several
+//! times harder. `--preset paper` has OTDF's scale.
+//!
 //! OTDF's loader also takes the next row for s', across the ends of episodes; this is not repeated here.
 
 use serde::{Deserialize, Serialize};

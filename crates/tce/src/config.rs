@@ -144,18 +144,7 @@ pub struct GuidanceConfig {
     pub dropout: f64,
     pub weight: f64,
     pub from: f64,
-    pub draw: ScoreDraw,
     pub rescore: bool,
-}
-
-/// How scores are drawn between a quantile and the maximum.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ScoreDraw {
-    /// Every rank is equally likely: scores as rows have them.
-    Ranks,
-    /// Every value is equally likely.
-    Values,
 }
 
 /// Which generated rows join the target rows.
@@ -369,7 +358,7 @@ impl Config {
         within("joint.ema", joint.ema, 0.0, 0.999_999)?;
         within("joint.guidance.dropout", joint.guidance.dropout, 0.0, 0.999)?;
         within("joint.guidance.weight", joint.guidance.weight, 0.0, 100.0)?;
-        within("joint.guidance.from", joint.guidance.from, 0.0, 1.0)?;
+        within("joint.guidance.from", joint.guidance.from, 0.0, 0.99)?;
         // A row is its own nearest neighbour.
         within("joint.scores.neighbour", joint.scores.neighbour as f64, 2.0, 1e6)?;
         within("joint.scores.reference", joint.scores.reference as f64, joint.scores.neighbour as f64, 1e12)?;

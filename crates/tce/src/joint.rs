@@ -2,15 +2,17 @@
 //!
 //! | | SynthER | DmC |
 //! |---|---|---|
-//! | trained on | target rows | source and target rows, all equally likely |
+//! | trained on | target rows | source rows |
 //! | condition | none | the row's score ([`tce_data::density`]), left out with probability `guidance.dropout` |
-//! | drawn under | none | scores c from the `guidance.from` quantile of the training scores up; D = D∅ + w (D_c − D∅) |
+//! | drawn under | none | c: one of the percentiles `guidance.from` to 99 % of the training scores; D = D∅ + w (D_c − D∅) |
 //! | standardised | every dimension by its mean and spread over the training rows, but not the terminal flag | the same |
 //! | afterwards | actions clipped to the box, terminal where the flag is above ½ | the same |
 //!
-//! "Uniform in the 90-100 percentile" of scores can be read in two ways (`guidance.draw`): uniform ranks, which ask for scores as
-//! rows have them, or uniform values between the two percentiles. The scores have a long tail (Hopper morph, 100k source rows:
-//! nine tenths below .09, the best target row 1), so that values ask mostly for what hardly a row has.
+//! DmC's target rows are in the scores alone, and a generated row has the score that it was drawn under: it ranks with the best tenth of
+//! the source rows, whatever came of it. `guidance.rescore` measures its score instead.
+//!
+//! The networks are [`tce_diffusion`]'s, and so is their training: narrower than the published ones, with Adam's usual β₂, no clipping of
+//! gradients, and a sampler of fewer steps without churn (settings of the preset `paper`: the published sizes, rows and steps).
 //!
 //! Dimensions that are constant in the training rows (Ant's contact slots, the flag of a robot that never falls) are left out
 //! and put back. Rows with a number that is not finite are dropped; there is no other filter.
@@ -31,7 +33,7 @@ use tce_diffusion::{
 };
 use tce_nn::{Device, NamedParameters, cpu};
 
-use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig, ScoreDraw};
+use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig};
 use crate::error::{Error, Result};
 use crate::expand::{Expansion, Generated};
 use crate::generator::{progress, run, start_rows};
@@ -55,27 +57,23 @@ struct RowUnits {
 }
 
 impl RowUnits {
-    /// The units in which the rows of `tables` together have mean 0 and variance 1.
-    fn fit(tables: &[&Transitions], target: Target) -> Self {
-        let columns = |t: &&Transitions| {
-            let width = t.obs_dim + t.act_dim + 1;
-            let mut head = Vec::with_capacity(t.len() * width);
-            for i in 0..t.len() {
-                head.extend_from_slice(t.observation(i));
-                head.extend_from_slice(t.action(i));
-                head.push(t.rewards[i]);
-            }
-            (head, width, tail(t, target), flags(t), t.obs_dim)
-        };
-        let parts: Vec<_> = tables.iter().map(columns).collect();
-        let rows: Vec<_> =
-            parts.iter().map(|(head, w, s2, flag, d)| Rows::join(&[(head, *w), (s2, *d), (flag, 1)])).collect();
-        let mut all = Standardizer::fit_on(&rows);
+    /// The units in which the rows of `t` have mean 0 and variance 1.
+    fn fit(t: &Transitions, target: Target) -> Self {
+        let width = t.obs_dim + t.act_dim + 1;
+        let mut head = Vec::with_capacity(t.len() * width);
+        for i in 0..t.len() {
+            head.extend_from_slice(t.observation(i));
+            head.extend_from_slice(t.action(i));
+            head.push(t.rewards[i]);
+        }
+        let (tail, flags) = (tail(t, target), flags(t));
+        let rows = Rows::join(&[(&head, width), (&tail, t.obs_dim), (&flags, 1)]);
+        let mut all = Standardizer::fit_on(&[rows]);
         let flag = all.dim() - 1;
         if !all.dead.contains(&flag) {
             (all.mean[flag], all.std[flag]) = (0.0, 1.0);
         }
-        let (obs_dim, act_dim, live) = (tables[0].obs_dim, tables[0].act_dim, all.live());
+        let (obs_dim, act_dim, live) = (t.obs_dim, t.act_dim, all.live());
         Self { obs_dim, act_dim, target, all, live }
     }
 
@@ -146,8 +144,8 @@ struct ScoreUnits {
 }
 
 impl ScoreUnits {
-    fn fit(scores: &[&[f32]]) -> Self {
-        let units = Standardizer::fit(&scores.concat(), 1);
+    fn fit(scores: &[f32]) -> Self {
+        let units = Standardizer::fit(scores, 1);
         Self { mean: units.mean[0], std: units.std[0] }
     }
 
@@ -158,27 +156,19 @@ impl ScoreUnits {
     }
 }
 
-/// All `scores`, ascending.
-fn ascending(scores: &[&[f32]]) -> Vec<f32> {
-    let mut all = scores.concat();
+/// A score for each of `uniform` ∈ [0, 1): one of the whole percentiles of `scores` from `from` to 99 %, all equally likely.
+fn draw_scores(scores: &[f32], from: f64, uniform: &[f32]) -> Vec<f32> {
+    let mut all = scores.to_vec();
     all.sort_by(f32::total_cmp);
-    all
-}
-
-/// A score for each of `uniform` ∈ [0, 1): at or above the quantile `from` of `all` scores, ascending.
-fn draw_scores(all: &[f32], from: f64, draw: ScoreDraw, uniform: &[f32]) -> Vec<f32> {
     // As numpy interpolates percentiles.
-    let quantile = |q: f64| {
-        let at = q * (all.len() - 1) as f64;
+    let percentile = |p: usize| {
+        let at = p as f64 / 100.0 * (all.len() - 1) as f64;
         let (low, high) = (all[at as usize] as f64, all[(at as usize + 1).min(all.len() - 1)] as f64);
-        low + at.fract() * (high - low)
+        (low + at.fract() * (high - low)) as f32
     };
-    let (least, most) = (quantile(from), quantile(1.0));
-    let score = |&u: &f32| match draw {
-        ScoreDraw::Ranks => quantile(from + u as f64 * (1.0 - from)),
-        ScoreDraw::Values => least + u as f64 * (most - least),
-    };
-    uniform.iter().map(|u| score(u) as f32).collect()
+    let first = (100.0 * from).round() as usize;
+    let drawn: Vec<f32> = (first..100).map(percentile).collect();
+    uniform.iter().map(|u| drawn[(u * drawn.len() as f32) as usize]).collect()
 }
 
 /// What training the network leaves behind.
@@ -210,7 +200,7 @@ pub(crate) fn enough_to_score(others: usize, target: usize, options: &DensityOpt
     Ok(())
 }
 
-/// DmC's scores of the source and target rows; computed once per pair of data sets.
+/// DmC's scores of the source rows; computed once per pair of data sets.
 pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<DensityScores> {
     #[derive(Serialize)]
     struct Spec<'a> {
@@ -218,7 +208,7 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
         options: &'a DensityOptions,
     }
     let file = "scores.safetensors";
-    let stage = Stage::open(root, "stages/scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
+    let stage = Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
     if let Some(scale) = stage.summary::<DensityScale>()? {
         let path = stage.file(file);
         let mut loaded = NamedParameters::load(&path)?;
@@ -228,15 +218,13 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
                 Error::missing(&path, format!("no tensor `{name}`; remove the directory to compute it again"))
             })
         };
-        return Ok(DensityScores { source: take("source")?, target: take("target")?, scale });
+        return Ok(DensityScores { source: take("source")?, scale });
     }
     let (source, target) = (inputs.source_rows()?, &inputs.target.rows);
     enough_to_score(source.len(), target.len(), options)?;
     let scores = density_scores(&Rows::transitions(source), &Rows::transitions(target), options, &score_streams())?;
     let mut out = NamedParameters::default();
-    for (name, values) in [("source", &scores.source), ("target", &scores.target)] {
-        out.tensors.insert(name.into(), (vec![values.len()], values.clone()));
-    }
+    out.tensors.insert("source".into(), (vec![scores.source.len()], scores.source.clone()));
     let attempt = stage.attempt()?;
     out.save(&attempt.file(file))?;
     attempt.finish(&[file.to_owned()], scores.scale)?;
@@ -258,6 +246,7 @@ fn train(
         inputs: InputSpec,
         seeds: &'a [u64],
         kind: GeneratedRows,
+        rows: &'static str,
         process: tce_diffusion::Process,
         target: Target,
         sizes: [usize; 3],
@@ -271,6 +260,7 @@ fn train(
         inputs: inputs.spec(scored.is_some()),
         seeds,
         kind,
+        rows: if scored.is_some() { "source" } else { "target" },
         process: j.process,
         target: j.target,
         sizes: [j.width, j.embedding, j.blocks],
@@ -286,27 +276,19 @@ fn train(
     }
     let started = std::time::Instant::now();
     let attempt = stage.attempt()?;
-    let target = &inputs.target.rows;
-    let source = scored.map(|_| inputs.source_rows()).transpose()?;
-    let tables: Vec<_> = source.into_iter().chain([target]).collect();
-    let units = RowUnits::fit(&tables, j.target);
-    let rows: Vec<_> = tables.iter().map(|t| units.encode(t)).collect();
+    let table = if scored.is_some() { inputs.source_rows()? } else { &inputs.target.rows };
+    let units = RowUnits::fit(table, j.target);
+    let rows = units.encode(table);
     let (d, c) = (units.live.len(), 2);
     let on = scored.map(|s| {
-        let scores = [s.source.as_slice(), s.target.as_slice()];
-        let units = ScoreUnits::fit(&scores);
-        (units, scores.map(|s| units.conditions(s)))
+        let units = ScoreUnits::fit(&s.source);
+        (units, units.conditions(&s.source))
     });
     let data = match &on {
         // No condition at all is the one that DmC's network learns beside the others.
-        None => {
-            ScoreData::new(vec![Part { rows: &rows[0], condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?
-        }
-        Some((_, on)) => {
-            let part = |(rows, on)| Part { rows, condition: Condition::Rows(on) };
-            let parts = rows.iter().map(Vec::as_slice).zip(on.iter().map(Vec::as_slice)).map(part).collect();
-            ScoreData::new(parts, d, c, false)?.with_dropout(j.guidance.dropout)?
-        }
+        None => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?,
+        Some((_, on)) => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, false)?
+            .with_dropout(j.guidance.dropout)?,
     };
     let network =
         NetworkConfig { width: j.width, embedding: j.embedding, blocks: j.blocks, ..NetworkConfig::new(d, c) };
@@ -350,8 +332,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     let units = &trained.units;
     // Per member, under which scores its rows are drawn.
     let under = scored.as_ref().map(|s| -> Vec<Vec<f32>> {
-        let all = ascending(&[&s.source, &s.target]);
-        let draw = |u: Vec<f32>| draw_scores(&all, j.guidance.from, j.guidance.draw, &u);
+        let draw = |u: Vec<f32>| draw_scores(&s.source, j.guidance.from, &u);
         members.iter().map(|m| draw(uniform_labels(m, "joint", j.rows, 1.0))).collect()
     });
     let condition = match (&under, &trained.scores) {
@@ -442,7 +423,7 @@ mod tests {
     fn decoding_undoes_encoding() {
         for (falls, target) in [(true, Target::Next), (false, Target::Next), (true, Target::Delta)] {
             let t = table(200, falls);
-            let units = RowUnits::fit(&[&t, &table(50, falls)], target);
+            let units = RowUnits::fit(&t, target);
             // 3 + 2 + 1 + 3 + 1 dimensions, without the constant one of s and s'; without falls the flag is constant, too.
             assert_eq!(units.live.len(), if falls { 8 } else { 7 });
             let rows = units.encode(&t);
@@ -465,7 +446,7 @@ mod tests {
     #[test]
     fn rows_off_the_box_are_clipped_and_broken_ones_left_out() {
         let t = table(100, true);
-        let units = RowUnits::fit(&[&t], Target::Next);
+        let units = RowUnits::fit(&t, Target::Next);
         let mut rows = units.encode(&t);
         let d = units.live.len();
         rows[2] = 50.0; // a₀ of row 0
@@ -477,19 +458,19 @@ mod tests {
         assert_eq!(back.terminals[1..3], [false, true]);
     }
 
-    /// Of 0, .0001, ..., .0099 and 1, the ranks from .9 on hold one 1 in ten, the values from .009 on mostly what no row has.
+    /// Of 0, .001, ..., 1 the percentiles from .9 on are .9, .91, ..., .99: each under a tenth of the rows.
     #[test]
     fn rows_are_drawn_under_the_best_scores() {
-        let few: Vec<f32> = (0..100).map(|i| i as f32 / 1e4).chain([1.0]).collect();
+        let scores: Vec<f32> = (0..=1000).rev().map(|i| i as f32 / 1e3).collect();
         let uniform: Vec<f32> = (0..1000).map(|i| i as f32 / 1e3).collect();
-        let draw = |by| draw_scores(&ascending(&[&few[50..], &few[..50]]), 0.9, by, &uniform);
-        let (ranks, values) = (draw(ScoreDraw::Ranks), draw(ScoreDraw::Values));
-        assert!((ranks[0] - 0.009).abs() < 1e-6 && (values[0] - 0.009).abs() < 1e-6);
-        let above = |x: &[f32]| x.iter().filter(|x| **x > 0.01).count();
-        assert_eq!((above(&ranks), above(&values)), (99, 998));
+        let drawn = draw_scores(&scores, 0.9, &uniform);
+        for (i, drawn) in drawn.iter().enumerate() {
+            assert!((drawn - (0.9 + (i / 100) as f32 / 100.0)).abs() < 1e-6, "{i}: {drawn}");
+        }
+        // Between two rows as numpy does it: numpy.percentile([0, 1], [90, 99]).
+        assert_eq!(draw_scores(&[1.0, 0.0], 0.9, &[0.0, 0.999]), [0.9, 0.99]);
 
-        let scores: Vec<f32> = (0..=100).map(|i| i as f32 / 100.0).collect();
-        let units = ScoreUnits::fit(&[&scores[..50], &scores[50..]]);
+        let units = ScoreUnits::fit(&scores);
         let on = units.conditions(&[units.mean, units.mean + units.std]);
         assert!(on[0].abs() < 1e-6 && (on[2] - 1.0).abs() < 1e-5 && (on[1], on[3]) == (1.0, 1.0), "{on:?}");
     }

@@ -86,7 +86,19 @@ impl Layered {
             let name = format!("--set {set}");
             layered.merge_into(parse_set(set)?, &name, Some(&known))?;
         }
+        layered.without_tce_regulariser(&["preset default", name])?;
         Ok(layered)
+    }
+
+    /// Eq. 10 is TCE's: rivals that stand on IQL as it is have no such term, unless it comes from somewhere else than `presets`.
+    fn without_tce_regulariser(&mut self, presets: &[&str]) -> Result<()> {
+        let algorithm = self.table["learner"].get("algorithm").and_then(Value::as_str).unwrap_or_default().to_owned();
+        let key = "learner.iql.regulariser";
+        let from_preset = self.origin.get(key).is_some_and(|o| presets.contains(&o.as_str()));
+        if from_preset && ["dara", "srpo", "igdf"].contains(&algorithm.as_str()) {
+            self.merge_into(parse_set(&format!("{key}=none"))?, &format!("learner {algorithm}"), None)?;
+        }
+        Ok(())
     }
 
     /// λ for variants that mix source rows in: Table C.5.
@@ -247,6 +259,7 @@ impl ConfigArgs {
 mod tests {
     use super::*;
     use tce_diffusion::Process;
+    use tce_learn::RegulariserKind;
 
     fn layered(preset: Preset, task: Option<&str>, sets: &[&str]) -> Result<Layered> {
         let sets: Vec<_> = sets.iter().map(|s| s.to_string()).collect();
@@ -290,6 +303,19 @@ mod tests {
         assert_eq!(origin("learner.steps"), "--set learner.steps=7");
         assert_eq!(origin("labels.training.steps"), "preset quick");
         assert_eq!(origin("learner.iql.expectile"), "preset default");
+    }
+
+    /// The behaviour term is TCE's. Rivals have one of their own or none, unless somebody asks for it.
+    #[test]
+    fn rivals_have_no_term_of_tce() {
+        let regulariser =
+            |sets: &[&str]| layered(Preset::Quick, None, sets).unwrap().config().unwrap().learner.iql.regulariser;
+        assert_eq!(regulariser(&[]), RegulariserKind::ForwardKl);
+        for rival in ["dara", "srpo", "igdf"] {
+            let algorithm = format!("learner.algorithm={rival}");
+            assert_eq!(regulariser(&[&algorithm]), RegulariserKind::None);
+            assert_eq!(regulariser(&[&algorithm, "learner.iql.regulariser=forward_kl"]), RegulariserKind::ForwardKl);
+        }
     }
 
     #[test]

@@ -78,7 +78,7 @@ impl Algorithm {
                 "dara",
                 "IQL; source rewards lowered where two classifiers tell the domains apart",
                 "Liu et al. 2022; ODRL",
-                Some("the classifiers' loss takes their softmax for logits"),
+                Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
                 "dara",
                 source,
             ),

@@ -138,7 +138,7 @@ impl Variant {
             format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n")
         };
         let rival = |algorithm: &str, table: &str, rest: &str| {
-            // As many generated rows as source rows, as DmC generates them.
+            // As many generated rows as source rows, as where DmC generates a million beside a million; it does so for smaller sources, too.
             let mixture = if table == "dmc" { iql("dmc", "all", 0.5) } else { iql("none", "all", 1.0) };
             format!("{mixture}learner.algorithm = {algorithm:?}\nlearner.iql.regulariser = \"none\"\n")
                 + rest
