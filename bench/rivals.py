@@ -46,7 +46,7 @@ def read_document(document, steps, where):
             files = json.loads((folder / "done.json").read_text())["files"]
         elif steps is None or where is None:
             raise SystemExit(f"{folder} is not here: say --steps and --processor")
-        device = row["learned"]["device"]
+        device = row["learned"].get("device", "cpu")
         for seed, score, evaluation in zip(row["seeds"], row["scores"], row["learned"]["evaluations"][-len(row["seeds"]) :]):
             assert evaluation["score"] == score
             yield {

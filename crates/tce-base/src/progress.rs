@@ -1,11 +1,13 @@
 //! Long work: a bar with an ETA on a terminal, a plain line now and then elsewhere; and the wish to stop.
 
 use std::io::IsTerminal;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
+use signal_hook::iterator::Signals;
 
 /// Time between two plain lines where there is no terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(15);
@@ -113,25 +115,29 @@ pub fn set_quiet(quiet: bool) {
     QUIET.store(quiet, Ordering::Relaxed);
 }
 
-fn flag() -> &'static Arc<AtomicBool> {
-    static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
-    FLAG.get_or_init(Default::default)
-}
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
 /// From now on SIGINT, SIGTERM and SIGUSR1 (a batch system's warning before its time limit) set a flag that long work looks at
-/// ([`interrupted`]). A second SIGINT or SIGTERM ends the process.
+/// ([`interrupted`]). A SIGINT or SIGTERM more than a second later ends the process.
 pub fn listen_for_interrupts() {
-    let _ = signal_hook::flag::register(signal_hook::consts::SIGUSR1, flag().clone());
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        // The order matters: the shutdown looks at the flag before the second hook sets it.
-        let _ = signal_hook::flag::register_conditional_shutdown(signal, 130, flag().clone());
-        let _ = signal_hook::flag::register(signal, flag().clone());
-    }
+    let Ok(mut signals) = Signals::new([SIGINT, SIGTERM, SIGUSR1]) else { return };
+    let listen = move || {
+        let mut first = None;
+        for signal in signals.forever() {
+            // One wish to stop is often two signals at once: `timeout` sends one to the process and one to its group.
+            let patience = first.get_or_insert_with(Instant::now).elapsed();
+            if signal != SIGUSR1 && patience > Duration::from_secs(1) {
+                signal_hook::low_level::exit(130);
+            }
+            INTERRUPTED.store(true, Ordering::Relaxed);
+        }
+    };
+    let _ = std::thread::Builder::new().name("signals".into()).spawn(listen);
 }
 
 /// Whether the user asked to stop. Long loops ask once per step and leave at the next safe point.
 pub fn interrupted() -> bool {
-    flag().load(Ordering::Relaxed)
+    INTERRUPTED.load(Ordering::Relaxed)
 }
 
 #[cfg(test)]

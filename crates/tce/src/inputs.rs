@@ -70,20 +70,21 @@ pub struct Behaviour {
     pub mean: f64,
     /// The spread of their returns.
     pub std: f64,
-    /// The mean return, normalised in the domain that the rows come from.
+    /// The mean return, normalised in the domain that the rows come from; None if no episode came to its end.
     pub score: Option<f64>,
 }
 
 impl Table {
     fn behaviour(&self, reference: Option<ReferenceScores>) -> Behaviour {
-        let returns = tce_data::inspect(&self.rows, EPISODE_LIMIT).returns;
+        let content = tce_data::inspect(&self.rows, EPISODE_LIMIT);
+        let returns = &content.returns;
         Behaviour {
             file: self.file.clone(),
             rows: self.rows.len(),
             episodes: returns.count,
             mean: returns.mean,
             std: returns.std,
-            score: reference.map(|r| r.normalised_score(returns.mean)),
+            score: reference.filter(|_| content.complete_episodes > 0).map(|r| r.normalised_score(returns.mean)),
         }
     }
 }

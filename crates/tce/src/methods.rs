@@ -14,6 +14,9 @@ use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
 use crate::joint::{enough_to_score, score_streams};
 
+/// [`Method::needs`] of learners that compare the domains.
+pub const SOURCE_ROWS: &str = "source rows";
+
 /// What `tce learn --list` prints of a learner.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Method {
@@ -50,7 +53,7 @@ impl Algorithm {
     /// What it is.
     pub fn method(self) -> Method {
         let any = "any rows, or none";
-        let source = "source rows";
+        let source = SOURCE_ROWS;
         let (name, description, reference, published, table, needs) = match self {
             Algorithm::Bc => (
                 "bc",

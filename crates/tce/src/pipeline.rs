@@ -45,6 +45,9 @@ pub struct Summary {
     pub seconds: f64,
     /// Where everything is.
     pub directory: PathBuf,
+    /// The files of the target's and the source's rows, if it had any, as they were called at the time.
+    #[serde(default)]
+    pub data: Vec<PathBuf>,
 }
 
 /// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
@@ -205,6 +208,10 @@ pub fn run(
         generated: reports,
         seconds: started.elapsed().as_secs_f64(),
         directory: stage.directory().to_owned(),
+        data: std::iter::once(&inputs.target)
+            .chain(&inputs.source)
+            .map(|t| std::path::absolute(&t.file).unwrap_or_else(|_| t.file.clone()))
+            .collect(),
     };
     // Without times, so that two copies of a run have the same bytes.
     let result = "result.json".to_owned();

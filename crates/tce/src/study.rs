@@ -173,10 +173,11 @@ fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder) {
     }
 }
 
-/// The directories in `directory`, ascending.
+/// The directories in `directory`, ascending, without hidden ones.
 fn directories(directory: &Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(directory).map_err(|e| FileError::new(directory, "read the directory", e))?;
     let mut found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
+    found.retain(|p| !name_of(p).starts_with('.'));
     found.sort();
     Ok(found)
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
-use common::{Tmpfs, files, silent, tce};
+use common::{Tmpfs, files, message, silent, tce};
 use tce_base::{Rng, Streams, sha256_hex};
 
 /// The whole pipeline in some seconds, with every stage long enough to be hit.
@@ -275,7 +275,7 @@ fn a_full_disk_costs_time_only() {
 }
 
 #[test]
-fn a_learning_goes_on_where_it_stopped_and_refuses_what_is_done() {
+fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
     let dir = tempfile::tempdir().unwrap();
     common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
     let args = |out: &'static str| {
@@ -291,13 +291,31 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_what_is_done() {
         let _ = child.kill();
         child.wait().unwrap();
     }
-    let last = start(dir.path(), &args("killed")).wait_with_output().unwrap();
-    let refused = String::from_utf8_lossy(&last.stderr).contains("holds the results of another");
-    assert!(last.status.success() || refused);
+    assert!(start(dir.path(), &args("killed")).wait().unwrap().success());
     for file in ["policy-seed0.safetensors", "metrics.jsonl"] {
         let bytes = ["whole", "killed"].map(|out| fs::read(dir.path().join(out).join(file)).unwrap());
         assert!(bytes[0] == bytes[1], "{file} differs");
     }
     assert!(kept(dir.path()).is_empty());
-    assert_eq!(tce(dir.path(), &args("whole")).status.code(), Some(2));
+
+    // Again, it is done; without its policy it is learned again; another learning has no business here.
+    let again = tce(dir.path(), &args("whole"));
+    assert!(again.status.success() && message(&again).contains("done before"), "{}", message(&again));
+    let refuse = |what: &str| {
+        let other = tce(dir.path(), &[&args("whole")[..], &["--set=learner.steps=700"]].concat());
+        assert_eq!(other.status.code(), Some(2));
+        let expected = format!("found {what} learning with other settings, seeds or files");
+        assert!(message(&other).contains(&expected), "{}", message(&other));
+    };
+    refuse("the results of");
+    let results = ["policy-seed0.safetensors", "summary.json"].map(|file| dir.path().join("whole").join(file));
+    let bytes = fs::read(&results[0]).unwrap();
+    for lost in [&results[..1], &results[..]] {
+        lost.iter().for_each(|file| fs::remove_file(file).unwrap());
+        if lost.len() == 2 {
+            refuse("an interrupted");
+        }
+        assert!(tce(dir.path(), &args("whole")).status.success());
+        assert!(fs::read(&results[0]).unwrap() == bytes);
+    }
 }

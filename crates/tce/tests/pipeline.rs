@@ -206,7 +206,7 @@ fn rivals_of_whole_transitions_run() {
     let mut kinds: Vec<String> =
         stages.map(|e| e.file_name().to_string_lossy().split('-').next().unwrap().to_owned()).collect();
     kinds.sort();
-    assert_eq!(kinds, ["generated", "generated", "joint", "joint", "scores"]);
+    assert_eq!(kinds, ["generated", "generated", "joint", "joint", "source"]);
     let spec = fs::read_to_string(file(synther, "spec.json")).unwrap();
     assert!(spec.contains("\"source\": null"), "{spec}");
 

@@ -78,7 +78,20 @@ fn a_sweep_ends_with_every_result_right() {
     assert!(message(&corrupt).contains("1 corrupt"), "{}", message(&corrupt));
     let partial = tce_json(dir.path(), &["sweep", "gather", folder, "--partial"]);
     assert_eq!(partial["rows"].as_array().unwrap().len(), 5);
-    fs::write(&policy, whole).unwrap();
+    // A launch that only looks whether files exist has nothing to do; one that reads them does the run again.
+    let launch = |more: &[&str]| {
+        let output = tce(dir.path(), &[&["sweep", "launch", folder], more].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        message(&output)
+    };
+    assert!(!launch(&[]).contains("to be done again"));
+    let redone = launch(&["--verify"]);
+    assert!(redone.contains("to be done again") && redone.contains("SHA-256"), "{redone}");
+    assert_eq!(fs::read(&policy).unwrap(), whole);
+    fs::remove_dir_all(policy.parent().unwrap()).unwrap();
+    assert!(launch(&[]).contains("no such file"));
+    assert_eq!(fs::read(&policy).unwrap(), whole);
+    assert_eq!(outcomes(&dir.path().join(folder)), before);
     let (lost, _) = before.iter().next().unwrap();
     fs::remove_file(dir.path().join(folder).join("done").join(lost)).unwrap();
     assert!(tce(dir.path(), &["sweep", "launch", folder]).status.success());

@@ -15,6 +15,7 @@ use crate::{DataError, Problem};
 /// in the file.
 const MAX_EXPANSION: u64 = 1040;
 const REPAIR: &str = "The file is damaged or incomplete: fetch or write it again";
+const NEWER: &str = "Written by a newer HDF5, or damaged: write it again by h5py with libver=\"v110\"";
 
 /// An open file. Reads on demand, so that memory follows the data sets that are asked for.
 pub(super) struct Hdf5 {
@@ -235,7 +236,9 @@ fn is_number(datatype: &Datatype) -> bool {
 /// Runs one call of the HDF5 library and puts its failure, a panic included, into our words.
 fn guard<T>(path: &Path, field: &str, call: impl FnOnce() -> Result<T, hdf5_pure::Error>) -> Result<T, DataError> {
     let malformed = |problem, found: String| {
-        DataError::invalid(problem, path, field, found, "a file that follows the HDF5 format", REPAIR)
+        // What the library does not know yet is no damage.
+        let repair = if found.contains("version") || found.contains("unsupported") { NEWER } else { REPAIR };
+        DataError::invalid(problem, path, field, found, "a file that follows the HDF5 format", repair)
     };
     match catch_unwind(AssertUnwindSafe(call)) {
         Ok(Ok(value)) => Ok(value),

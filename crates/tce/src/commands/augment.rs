@@ -53,6 +53,7 @@ impl Augment {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
         super::refuse_existing(&self.out, self.force)?;
+        super::refuse_inputs(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target)?.with_target_rows(config.target.rows);
         let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;

@@ -87,7 +87,16 @@ impl Collect {
         let data = recipe.collect()?;
         save_d4rl(&self.out, &data, &attributes, &[])?;
         let content = tce_data::inspect(&data, EPISODE_LIMIT);
-        let reference = reference_scores(agent, shift, ScoreTable::default());
+        let whole = content.complete_episodes > 0;
+        if !whole {
+            eprintln!(
+                "no episode came to its end: {} rows on {} lanes are {} steps each; for whole episodes take more rows or fewer --lanes",
+                self.rows,
+                self.lanes,
+                self.rows / self.lanes
+            );
+        }
+        let reference = reference_scores(agent, shift, ScoreTable::default()).filter(|_| whole);
         let collected = Collected {
             file: self.out,
             environment: format!("{agent}-{shift}"),

@@ -1,11 +1,11 @@
 //! `tce learn`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::Args;
-use serde::Serialize;
-use tce_base::{sha256_file, sha256_hex};
+use serde::{Deserialize, Serialize};
+use tce_base::{read_if_there, sha256_file, sha256_hex};
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, parse_environment};
 use tce_nn::Device;
 
@@ -54,7 +54,7 @@ pub struct Learn {
     config: ConfigArgs,
 }
 
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 struct Report {
     policies: Vec<PathBuf>,
     seeds: Vec<u64>,
@@ -72,13 +72,23 @@ impl Learn {
         };
         self.config = self.config.with_learner(self.learner);
         self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
+        if self.learner == Some(Algorithm::Dmc) {
+            // The rows are in the files here; without scores of their own they are scored as source rows are.
+            self.config.sets.splice(0..0, ["mixture.generated=none".to_owned(), "mixture.source=all".to_owned()]);
+        }
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        // A training that was interrupted left metrics, but no result.
-        if out.join("summary.json").exists() {
+        let method = config.learner.algorithm.method();
+        if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
             return Err(Error::Usage(format!(
-                "{} holds the results of another learning; choose another --out",
-                out.display()
+                "--top: found --learner {}, expected bc, whose option it is",
+                method.name
+            )));
+        }
+        if self.extra.is_none() && method.needs == crate::methods::SOURCE_ROWS {
+            return Err(Error::Usage(format!(
+                "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
+                method.name
             )));
         }
         let dims = self.env.map(|(agent, _)| agent.dims());
@@ -113,6 +123,12 @@ impl Learn {
         Processor::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
+        if let Some(report) = found(&out, &spec)? {
+            eprintln!("done before, in {}", out.display());
+            output.print(&report, render);
+            return Ok(());
+        }
+        tce_base::write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
         let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
@@ -125,19 +141,57 @@ impl Learn {
         })?;
         let report = Report { policies: files, seeds, learned };
         tce_base::write_json(&out.join("summary.json"), &report)?;
-        output.print(&report, |r| {
-            let rows = r.policies.iter().enumerate().map(|(m, path)| {
-                let evaluation = r.learned.evaluations.get(m);
-                [
-                    path.display().to_string(),
-                    evaluation.filter(|e| e.failed.is_none()).map_or("-".into(), |e| plus_minus(&e.returns)),
-                    evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
-                ]
-            });
-            table(&["policy", "return", "score"], rows)
-        });
+        output.print(&report, render);
         Ok(())
     }
+}
+
+/// What a learning of `spec` left in `out`, if it came to its end; None where it is to begin or to go on.
+///
+/// # Errors
+/// If another learning's results, or what it left when it was interrupted, are there.
+fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Report>> {
+    let (spec_file, summary_file) = (out.join("spec.json"), out.join("summary.json"));
+    let summary = read_if_there(&summary_file)?;
+    let same = match read_if_there(&spec_file)? {
+        Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| found == *spec),
+        None => summary.is_none(),
+    };
+    if !same {
+        let end = if summary.is_some() { "the results of" } else { "an interrupted" };
+        return Err(Error::Usage(format!(
+            "{}: found {end} learning with other settings, seeds or files; choose another --out{}",
+            out.display(),
+            if summary.is_some() { " (tce evaluate judges a policy that is there)" } else { ", or remove it" }
+        )));
+    }
+    let Some(bytes) = summary else { return Ok(None) };
+    let report = serde_json::from_slice::<Report>(&bytes);
+    match report.map(|r| (r.policies.iter().all(|p| p.exists()), r)) {
+        Ok((true, report)) => Ok(Some(report)),
+        // Its policies were removed or moved: they are learned again.
+        _ => Ok(None),
+    }
+}
+
+fn render(report: &Report) -> String {
+    let rows = report.policies.iter().enumerate().map(|(m, path)| {
+        let evaluation = report.learned.evaluations.get(m);
+        [
+            path.display().to_string(),
+            evaluation.filter(|e| e.failed.is_none()).map_or("-".into(), |e| plus_minus(&e.returns)),
+            evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
+        ]
+    });
+    let mut text = table(&["policy", "return", "score"], rows);
+    for (m, seed) in report.seeds.iter().enumerate() {
+        let broken = report.learned.figures.iter().filter(|(_, values)| values.get(m).is_some_and(Option::is_none));
+        let names: Vec<_> = broken.map(|(name, _)| name.as_str()).collect();
+        if !names.is_empty() {
+            text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
+        }
+    }
+    text
 }
 
 fn list(methods: &[Method; Algorithm::ALL.len()]) -> String {

@@ -112,6 +112,19 @@ impl Cli {
     }
 }
 
+/// Refuses to write over what is read.
+fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
+    let same = |input: &&&Path| out.canonicalize().is_ok_and(|out| input.canonicalize().is_ok_and(|i| i == out));
+    match inputs.iter().find(same) {
+        Some(input) => Err(Error::Usage(format!(
+            "--out {}: found one of the inputs, {}; choose another name",
+            out.display(),
+            input.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
 /// An output that exists is only replaced when the user says so.
 fn refuse_existing(path: &Path, force: bool) -> Result<()> {
     if path.exists() && !force {

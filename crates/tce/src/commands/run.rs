@@ -3,10 +3,11 @@
 use clap::Args;
 use serde::Serialize;
 use tce_data::Task;
+use tce_learn::LabelErrors;
 use tce_nn::Device;
 
 use crate::config::Algorithm;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::inputs::{Behaviour, DataArgs, Inputs};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
@@ -60,6 +61,13 @@ struct Row {
 impl Run {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
+        if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::FLOORS.contains(v))) {
+            return Err(Error::Usage(format!(
+                "--learner {}: found floors alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
+                learner.method().name,
+                self.variant.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+            )));
+        }
         let mut variants: Vec<(Variant, bool)> = Vec::new();
         if !self.no_floors {
             let floors = Variant::FLOORS.into_iter().filter(|f| !self.variant.contains(f));
@@ -127,14 +135,19 @@ fn render(report: &Report) -> String {
         let mean = |f: &dyn Fn(&crate::expand::Generated) -> f64| {
             r.summary.generated.iter().map(f).sum::<f64>() / r.summary.generated.len() as f64
         };
+        // Where the generator makes whole transitions there are no label models.
+        let rmse = |f: &dyn Fn(&LabelErrors) -> f64| {
+            let value = mean(&|g| g.labels.as_ref().map_or(f64::NAN, f));
+            if value.is_finite() { format!("{value:.4}") } else { "-".into() }
+        };
         [
             r.title.clone(),
             format!("{:.0}", mean(&|g| g.sampled as f64)),
             format!("{:.1} %", 100.0 * mean(&|g| 1.0 - g.kept as f64 / g.sampled as f64)),
             format!("{:.1} %", 100.0 * mean(&|g| g.outside_box)),
             format!("{:.2} %", 100.0 * mean(&|g| g.terminal)),
-            format!("{:.4}", mean(&|g| g.labels.map_or(f64::NAN, |l| l.action_rmse))),
-            format!("{:.4}", mean(&|g| g.labels.map_or(f64::NAN, |l| l.reward_rmse))),
+            rmse(&|l| l.action_rmse),
+            rmse(&|l| l.reward_rmse),
         ]
     });
     let generated: Vec<_> = generated.collect();

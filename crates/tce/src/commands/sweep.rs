@@ -79,6 +79,9 @@ pub struct Launch {
     /// slurm: an argument for sbatch, such as --sbatch=--time=04:00:00; may be given several times.
     #[arg(long, value_name = "ARGUMENT", allow_hyphen_values = true)]
     sbatch: Vec<String>,
+    /// Read every file of what is done, and do again what was changed since. Work whose files are gone is done again in any case.
+    #[arg(long)]
+    verify: bool,
     /// Only tell what would be done.
     #[arg(long)]
     dry_run: bool,
@@ -182,6 +185,11 @@ impl Launch {
             return Err(Error::Usage("--workers, --threads-each and --pack must be at least 1".into()));
         }
         let sweep = Sweep::open(&self.directory)?;
+        if !self.dry_run {
+            for what in sweep.take_back_damaged(self.verify)? {
+                eprintln!("to be done again: {what}");
+            }
+        }
         match self.launcher {
             Launcher::Slurm => {
                 let arrays = sweep.launch_slurm(&Submission {

@@ -123,7 +123,8 @@ impl Gathered {
         if lists.iter().all(|(_, list)| list.is_empty()) {
             return Ok(());
         }
-        let mut text = String::from("the table would be partial; launch the sweep again, or say --partial\n");
+        let verify = if self.corrupt.is_empty() { "" } else { " with --verify" };
+        let mut text = format!("the table would be partial; launch the sweep again{verify}, or say --partial\n");
         for (what, list) in lists.iter().filter(|(_, list)| !list.is_empty()) {
             text += &format!("{} {what}:\n", list.len());
             text.extend(list.iter().take(20).map(|item| format!("  {item}\n")));

@@ -29,6 +29,7 @@ use crate::variant::Variant;
 
 pub mod gather;
 pub mod local;
+mod repair;
 pub mod slurm;
 pub mod status;
 pub mod work;

@@ -162,7 +162,13 @@ impl GeneratorArgs {
                     self.rows,
                     self.seed,
                 )?;
-                eprintln!("{} {}: {quality:?}", process_name(&process), sampler_name(sampler));
+                eprintln!(
+                    "{} {}: SW to held-out states {:.3}, consistency {:.3}",
+                    process_name(&process),
+                    sampler_name(sampler),
+                    quality.sw_held_out,
+                    quality.consistency.median
+                );
                 rows.push(Row { process: process_name(&process), sampler: sampler_name(sampler), quality });
             }
         }

@@ -104,6 +104,8 @@ struct Finished {
     root: PathBuf,
     target: String,
     source: Option<String>,
+    /// Where the run's target and source rows were, where it tells.
+    data: Vec<PathBuf>,
 }
 
 impl Finished {
@@ -123,7 +125,8 @@ impl Finished {
             Error::Failed(format!("{}: {why}; is this a run of this version of tce?", directory.join(name).display()))
         };
         let (spec, config) = (read("spec.json")?, read("config.toml")?);
-        read("done.json")?;
+        let done = read("done.json")?;
+        let done: serde_json::Value = serde_json::from_str(&done).map_err(|e| damaged("done.json", e.to_string()))?;
         let spec: serde_json::Value = serde_json::from_str(&spec).map_err(|e| damaged("spec.json", e.to_string()))?;
         let (inputs, seeds) = (&spec["spec"]["inputs"], &spec["spec"]["seeds"]);
         let seeds = serde_json::from_value(seeds.clone()).map_err(|e| damaged("spec.json", format!("seeds: {e}")))?;
@@ -144,6 +147,7 @@ impl Finished {
             root: folder.and_then(Path::parent).unwrap_or(Path::new(".")).to_owned(),
             target: hash("target").ok_or_else(|| damaged("spec.json", "inputs.target: missing".into()))?,
             source: hash("source"),
+            data: serde_json::from_value(done["summary"]["data"].clone()).unwrap_or_default(),
         })
     }
 
@@ -206,9 +210,10 @@ impl RunArgs {
                 let seed = self.seed.unwrap_or(run.seeds[0]);
                 member_of(&run.seeds, seed)?;
                 let root = self.out.unwrap_or_else(|| run.root.clone());
+                let file = |index: usize| run.data.get(index).filter(|file| file.exists()).cloned();
                 let data = DataArgs {
-                    source: self.source,
-                    target: self.target,
+                    source: self.source.or_else(|| file(1)),
+                    target: self.target.or_else(|| file(0)),
                     from_zoo: self.from_zoo,
                     out: run.root.clone(),
                 };

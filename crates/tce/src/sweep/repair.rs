@@ -1,0 +1,72 @@
+//! Work that counts as done and whose files are gone or changed: it is taken back, and done again by the next launch.
+//!
+//! Nothing is removed. The record and the files get names that nobody looks for (`.NAME.damaged-N`), beside where they were.
+
+use std::fs;
+use std::path::Path;
+
+use tce_base::{FileError, first_damaged};
+
+use super::work::{Failure, Outcome, now};
+use super::{Entry, Kind, Sweep};
+use crate::error::Result;
+
+impl Sweep {
+    /// Takes back what is done and no longer whole, and tells what it was. Whether files exist is always looked at, their content if
+    /// `thorough`.
+    ///
+    /// # Errors
+    /// If a folder cannot be written.
+    pub fn take_back_damaged(&self, thorough: bool) -> Result<Vec<String>> {
+        let mut taken = Vec::new();
+        for entry in self.entries() {
+            let why = match self.outcome(entry) {
+                Ok(None) => continue,
+                Ok(Some(outcome)) => {
+                    let Some(why) = self.lost(&outcome, thorough) else { continue };
+                    self.set_aside(entry, &outcome)?;
+                    why
+                }
+                Err(e) => e.to_string(),
+            };
+            let record = self.file("done", &format!("{}.json", entry.id));
+            move_aside(&record)?;
+            let error = format!("it was done, and is to be done again: {why}");
+            tce_base::write_json(&self.file("failed", &format!("{}.json", entry.id)), &Failure { error, at: now() })?;
+            taken.push(format!("{entry}: {why}"));
+        }
+        Ok(taken)
+    }
+
+    /// The first file that is not what it was.
+    fn lost(&self, outcome: &Outcome, thorough: bool) -> Option<String> {
+        let place = self.directory.join(&outcome.place);
+        if thorough {
+            return first_damaged(&place, &outcome.files);
+        }
+        let missing = outcome.files.keys().map(|name| place.join(name)).find(|file| !file.exists());
+        missing.map(|file| format!("{}: no such file", file.display()))
+    }
+
+    fn set_aside(&self, entry: &Entry, outcome: &Outcome) -> Result<()> {
+        let place = self.directory.join(&outcome.place);
+        match entry.kind {
+            // These lie in one folder with those of other tasks.
+            Kind::Source | Kind::Target => outcome.files.keys().try_for_each(|name| move_aside(&place.join(name))),
+            Kind::Distances | Kind::Expand | Kind::Run => move_aside(&place),
+        }
+    }
+}
+
+/// Gives what is at `path` a name that is not taken, if there is anything.
+fn move_aside(path: &Path) -> Result<()> {
+    let old = path.file_name().unwrap_or_default().to_string_lossy();
+    let name = |n: usize| path.with_file_name(format!(".{old}.damaged-{n}"));
+    let free = (1..).map(name).find(|p| !p.exists()).expect("there are more numbers than files");
+    match fs::rename(path, &free) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+            Err(FileError::new(&free, "rename what is damaged to", e).into())
+        }
+        _ => Ok(()),
+    }
+}
