@@ -101,6 +101,30 @@ fn wrong_calls_end_with_code_2() {
 
 /// On a file system of a few pages the output does not fit: one message, exit code 1, nothing left behind.
 #[test]
+fn options_that_would_do_something_else_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    data_pair(dir, Agent::Hopper, Shift::Morph);
+    let (learn, task) = (["learn", "--target", "target.hdf5", "--out", "out"], "hopper-morph:medium->expert");
+    let before = fs::read(dir.join("source.hdf5")).unwrap();
+    for (args, words) in [
+        (
+            &["augment", "--source", "source.hdf5", "--target", "target.hdf5", "--out", "./source.hdf5", "--force"][..],
+            "one of the inputs",
+        ),
+        (&[&learn[..], &["--learner", "iql", "--top", "0.1"]].concat(), "expected bc"),
+        (&[&learn[..], &["--learner", "dara"]].concat(), "--extra FILE"),
+        (&["run", task, "--variant", "target-only,bc", "--learner", "td3-bc"], "found floors alone"),
+    ] {
+        let output = tce(dir, args);
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {}", message(&output));
+        assert!(message(&output).contains(words), "{args:?}: {}", message(&output));
+    }
+    assert!(fs::read(dir.join("source.hdf5")).unwrap() == before);
+    assert!(!dir.join("out").exists() && !dir.join("runs").exists(), "before any work");
+}
+
+#[test]
 fn a_full_disk_leaves_nothing_behind() {
     let dir = tempfile::tempdir().unwrap();
     let mount = dir.path().join("small");

@@ -147,7 +147,7 @@ fn every_rival_runs_and_says_its_mode() {
 }
 
 #[test]
-fn learners_are_listed() {
+fn learners_are_listed_and_learn_from_two_files() {
     let dir = tempfile::tempdir().unwrap();
     let list = tce_json(dir.path(), &["learn", "--list"]);
     let names: Vec<_> = list.as_array().unwrap().iter().map(|m| m["name"].as_str().unwrap().to_owned()).collect();
@@ -157,6 +157,21 @@ fn learners_are_listed() {
         assert!(text.contains(method["name"].as_str().unwrap()));
     }
     assert_eq!(tce(dir.path(), &["learn"]).status.code(), Some(2), "without --list, files are needed");
+
+    data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    for name in &names {
+        let mut args =
+            vec!["learn", "--learner", name, "--target", "target.hdf5", "--extra", "source.hdf5", "--out", name];
+        args.extend(TINY);
+        args.extend(["--set=joint.scores.reference=500", "--set=learner.steps=3", "--set=learner.igdf.steps=5"]);
+        args.extend(["--set=learner.bosa.cvae.steps=5", "--set=learner.meta_dt.world_model.steps=5"]);
+        let learned = tce_json(dir.path(), &args);
+        assert!(dir.path().join(learned["policies"][0].as_str().unwrap()).exists(), "{name}");
+        // No rival has TCE's own term.
+        let config = fs::read_to_string(dir.path().join(name).join("config.toml")).unwrap();
+        let plain = config.contains("regulariser = \"none\"");
+        assert_eq!(plain, ["dara", "srpo", "igdf"].contains(&name.as_str()), "{name}");
+    }
 }
 
 /// Rivals whose rows come from one network over whole transitions: the same bytes at any thread count, one stage for both forms of
