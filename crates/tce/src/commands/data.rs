@@ -221,6 +221,9 @@ fn render_checks(all: &Vec<Checked>) -> String {
         for finding in c.check.findings.iter().filter(|f| f.severity > Severity::Note) {
             text += &format!("  {}: {}\n", finding.field, finding.message);
         }
+        if c.passes && c.replay.is_none() {
+            text += "  passes: shapes, numbers, ranges and episodes; whether s' follows from s and a is told by --replay\n";
+        }
     }
     let rows = all.iter().filter_map(|c| {
         let r = c.replay.as_ref()?;
