@@ -222,7 +222,8 @@ fn render_checks(all: &Vec<Checked>) -> String {
             text += &format!("  {}: {}\n", finding.field, finding.message);
         }
         if c.passes && c.replay.is_none() {
-            text += "  passes: shapes, numbers, ranges and episodes; whether s' follows from s and a is told by --replay\n";
+            text +=
+                "  passes: shapes, numbers, ranges and episodes; whether s' follows from s and a is told by --replay\n";
         }
     }
     let rows = all.iter().filter_map(|c| {
