@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::moments::Moments;
-use crate::{Rows, Transitions};
+use crate::{ReferenceScores, Rows, Transitions};
 
 /// Mean, spread and range of one number per episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -100,6 +100,13 @@ pub struct Inspection {
     pub next_observations: DimensionSummary,
     /// r, one dimension.
     pub rewards: DimensionSummary,
+}
+
+impl Inspection {
+    /// The mean return, normalised by `reference`; None if no episode is complete: a part of a return is no return.
+    pub fn normalised_score(&self, reference: Option<ReferenceScores>) -> Option<f64> {
+        reference.filter(|_| self.complete_episodes > 0).map(|r| r.normalised_score(self.returns.mean))
+    }
 }
 
 /// Measures `data`. An episode is complete if it ended by a terminal or is at most two rows short of `step_limit`: the

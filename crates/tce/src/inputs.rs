@@ -77,14 +77,14 @@ pub struct Behaviour {
 impl Table {
     fn behaviour(&self, reference: Option<ReferenceScores>) -> Behaviour {
         let content = tce_data::inspect(&self.rows, EPISODE_LIMIT);
-        let returns = &content.returns;
+        let (returns, score) = (&content.returns, content.normalised_score(reference));
         Behaviour {
             file: self.file.clone(),
             rows: self.rows.len(),
             episodes: returns.count,
             mean: returns.mean,
             std: returns.std,
-            score: reference.filter(|_| content.complete_episodes > 0).map(|r| r.normalised_score(returns.mean)),
+            score,
         }
     }
 }

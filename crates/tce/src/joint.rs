@@ -156,8 +156,8 @@ impl ScoreUnits {
     }
 }
 
-/// A score for each of `uniform` ∈ [0, 1): one of the whole percentiles of `scores` from `from` to 99 %, all equally likely.
-fn draw_scores(scores: &[f32], from: f64, uniform: &[f32]) -> Vec<f32> {
+/// The whole percentiles of `scores` from `from` to 99 %.
+fn best_percentiles(scores: &[f32], from: f64) -> Vec<f32> {
     let mut all = scores.to_vec();
     all.sort_by(f32::total_cmp);
     // As numpy interpolates percentiles.
@@ -167,8 +167,12 @@ fn draw_scores(scores: &[f32], from: f64, uniform: &[f32]) -> Vec<f32> {
         (low + at.fract() * (high - low)) as f32
     };
     let first = (100.0 * from).round() as usize;
-    let drawn: Vec<f32> = (first..100).map(percentile).collect();
-    uniform.iter().map(|u| drawn[(u * drawn.len() as f32) as usize]).collect()
+    (first..100).map(percentile).collect()
+}
+
+/// One of `scores` for each of `uniform` ∈ [0, 1), all equally likely.
+fn draw_scores(scores: &[f32], uniform: &[f32]) -> Vec<f32> {
+    uniform.iter().map(|u| scores[(u * scores.len() as f32) as usize]).collect()
 }
 
 /// What training the network leaves behind.
@@ -332,7 +336,8 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     let units = &trained.units;
     // Per member, under which scores its rows are drawn.
     let under = scored.as_ref().map(|s| -> Vec<Vec<f32>> {
-        let draw = |u: Vec<f32>| draw_scores(&s.source, j.guidance.from, &u);
+        let best = best_percentiles(&s.source, j.guidance.from);
+        let draw = |u: Vec<f32>| draw_scores(&best, &u);
         members.iter().map(|m| draw(uniform_labels(m, "joint", j.rows, 1.0))).collect()
     });
     let condition = match (&under, &trained.scores) {
@@ -463,12 +468,12 @@ mod tests {
     fn rows_are_drawn_under_the_best_scores() {
         let scores: Vec<f32> = (0..=1000).rev().map(|i| i as f32 / 1e3).collect();
         let uniform: Vec<f32> = (0..1000).map(|i| i as f32 / 1e3).collect();
-        let drawn = draw_scores(&scores, 0.9, &uniform);
+        let drawn = draw_scores(&best_percentiles(&scores, 0.9), &uniform);
         for (i, drawn) in drawn.iter().enumerate() {
             assert!((drawn - (0.9 + (i / 100) as f32 / 100.0)).abs() < 1e-6, "{i}: {drawn}");
         }
         // Between two rows as numpy does it: numpy.percentile([0, 1], [90, 99]).
-        assert_eq!(draw_scores(&[1.0, 0.0], 0.9, &[0.0, 0.999]), [0.9, 0.99]);
+        assert_eq!(draw_scores(&best_percentiles(&[1.0, 0.0], 0.9), &[0.0, 0.999]), [0.9, 0.99]);
 
         let units = ScoreUnits::fit(&scores);
         let on = units.conditions(&[units.mean, units.mean + units.std]);

@@ -99,7 +99,6 @@ fn wrong_calls_end_with_code_2() {
     assert!(String::from_utf8_lossy(&output.stderr).contains("TCE_SHARED"));
 }
 
-/// On a file system of a few pages the output does not fit: one message, exit code 1, nothing left behind.
 #[test]
 fn options_that_would_do_something_else_are_refused() {
     let dir = tempfile::tempdir().unwrap();
@@ -124,6 +123,7 @@ fn options_that_would_do_something_else_are_refused() {
     assert!(!dir.join("out").exists() && !dir.join("runs").exists(), "before any work");
 }
 
+/// On a file system of a few pages the output does not fit: one message, exit code 1, nothing left behind.
 #[test]
 fn a_full_disk_leaves_nothing_behind() {
     let dir = tempfile::tempdir().unwrap();

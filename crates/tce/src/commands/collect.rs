@@ -87,8 +87,7 @@ impl Collect {
         let data = recipe.collect()?;
         save_d4rl(&self.out, &data, &attributes, &[])?;
         let content = tce_data::inspect(&data, EPISODE_LIMIT);
-        let whole = content.complete_episodes > 0;
-        if !whole {
+        if content.complete_episodes == 0 {
             eprintln!(
                 "no episode came to its end: {} rows on {} lanes are {} steps each; for whole episodes take more rows or fewer --lanes",
                 self.rows,
@@ -96,12 +95,12 @@ impl Collect {
                 self.rows / self.lanes
             );
         }
-        let reference = reference_scores(agent, shift, ScoreTable::default()).filter(|_| whole);
+        let reference = reference_scores(agent, shift, ScoreTable::default());
         let collected = Collected {
             file: self.out,
             environment: format!("{agent}-{shift}"),
             recipe,
-            normalised_score: reference.map(|r| r.normalised_score(content.returns.mean)),
+            normalised_score: content.normalised_score(reference),
             content,
             seconds: started.elapsed().as_secs_f64(),
         };

@@ -111,7 +111,7 @@ impl Inspect {
                 load: report,
                 environment: environment.map(|(a, s)| format!("{a}-{s}")),
                 looks_like: infer_agents(&transitions),
-                normalised_score: reference.map(|r| r.normalised_score(content.returns.mean)),
+                normalised_score: content.normalised_score(reference),
                 content,
             });
         }

@@ -104,18 +104,6 @@ impl Learn {
             ensure_same_agent(extra, &target)?;
         }
         let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
-        let row_scores = match &extra {
-            Some(extra) => row_scores(&config, &target, extra)?,
-            None => None,
-        };
-        let member = |&seed: &u64| MemberData {
-            seed,
-            target: target.clone(),
-            extra: extra.clone(),
-            row_scores: row_scores.clone(),
-            trajectories: vec![target.clone()],
-        };
-        let data = seeds.iter().map(member).collect();
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
             "target": sha256_file(&target_file)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
@@ -128,6 +116,18 @@ impl Learn {
             output.print(&report, render);
             return Ok(());
         }
+        let row_scores = match &extra {
+            Some(extra) => row_scores(&config, &target, extra)?,
+            None => None,
+        };
+        let member = |&seed: &u64| MemberData {
+            seed,
+            target: target.clone(),
+            extra: extra.clone(),
+            row_scores: row_scores.clone(),
+            trajectories: vec![target.clone()],
+        };
+        let data = seeds.iter().map(member).collect();
         tce_base::write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();

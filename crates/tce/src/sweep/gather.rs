@@ -101,7 +101,8 @@ impl Sweep {
         conflicts
     }
 
-    fn damage(&self, entry: &Entry, outcome: &Outcome) -> Option<String> {
+    /// What is wrong with the record or the files of a piece of work.
+    pub(super) fn damage(&self, entry: &Entry, outcome: &Outcome) -> Option<String> {
         if outcome.id != entry.id {
             return Some(format!("found the outcome of {}, expected that of {}", outcome.id, entry.id));
         }

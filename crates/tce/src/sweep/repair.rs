@@ -5,7 +5,7 @@
 use std::fs;
 use std::path::Path;
 
-use tce_base::{FileError, first_damaged};
+use tce_base::FileError;
 
 use super::work::{Failure, Outcome, now};
 use super::{Entry, Kind, Sweep};
@@ -23,8 +23,12 @@ impl Sweep {
             let why = match self.outcome(entry) {
                 Ok(None) => continue,
                 Ok(Some(outcome)) => {
-                    let Some(why) = self.lost(&outcome, thorough) else { continue };
-                    self.set_aside(entry, &outcome)?;
+                    let damage = if thorough { self.damage(entry, &outcome) } else { self.lost(&outcome) };
+                    let Some(why) = damage else { continue };
+                    // A record that is another piece's has that piece's files.
+                    if outcome.id == entry.id {
+                        self.set_aside(entry, &outcome)?;
+                    }
                     why
                 }
                 Err(e) => e.to_string(),
@@ -38,12 +42,9 @@ impl Sweep {
         Ok(taken)
     }
 
-    /// The first file that is not what it was.
-    fn lost(&self, outcome: &Outcome, thorough: bool) -> Option<String> {
+    /// The first file that is not there.
+    fn lost(&self, outcome: &Outcome) -> Option<String> {
         let place = self.directory.join(&outcome.place);
-        if thorough {
-            return first_damaged(&place, &outcome.files);
-        }
         let missing = outcome.files.keys().map(|name| place.join(name)).find(|file| !file.exists());
         missing.map(|file| format!("{}: no such file", file.display()))
     }
