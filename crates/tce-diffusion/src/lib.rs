@@ -16,6 +16,7 @@ mod process;
 mod sampler;
 mod target;
 mod train;
+mod until_done;
 
 pub use data::{Condition, Part, ScoreData, present};
 pub use error::DiffusionError;
@@ -25,3 +26,4 @@ pub use process::{Edm, Grid, Increment, Level, Precondition, Process, Start, Ve,
 pub use sampler::{Denoiser, Guided, Sampler};
 pub use target::Target;
 pub use train::{Schedule, TrainConfig, Trainer};
+pub use until_done::{CycleEnd, UntilDone};

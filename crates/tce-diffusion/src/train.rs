@@ -13,6 +13,7 @@ use tce_nn::{
     on_threads_of, tensor,
 };
 
+use crate::until_done::Found;
 use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
 
 /// Steps between two reports of the loss.
@@ -97,6 +98,8 @@ pub struct Trainer {
     network: Trained<ScoreNetwork>,
     average: Option<Averaged<ScoreNetwork>>,
     step: u64,
+    /// What a training until done has found at the ends of its cycles.
+    pub(crate) found: Found,
     /// Raised by whichever of several trainings diverges.
     stop: Arc<AtomicBool>,
 }
@@ -125,12 +128,23 @@ impl Trainer {
         let network = spec.init(members, name, &device);
         let average = (config.ema > 0.0).then(|| Averaged::new(&network));
         let (name, members, network) = (name.to_owned(), members.to_vec(), Trained::new(network));
-        Ok(Self { name, spec, process, config, members, device, network, average, step: 0, stop: Arc::default() })
+        let (found, stop) = (Found::default(), Arc::default());
+        Ok(Self { name, spec, process, config, members, device, network, average, step: 0, found, stop })
     }
 
     /// Several trainings that are of use only together share a flag: when one diverges, the others stop too.
     pub fn stop_with(&mut self, other: &Trainer) {
         self.stop = other.stop.clone();
+    }
+
+    /// The highest learning rate.
+    pub(crate) fn highest_rate(&self) -> f64 {
+        self.config.learning_rate
+    }
+
+    /// The device without autodiff.
+    pub(crate) fn plain_device(&self) -> Device {
+        self.sampling_network().device()
     }
 
     /// Steps taken.
@@ -154,12 +168,29 @@ impl Trainer {
         data: &[ScoreData],
         steps: u64,
         checkpoints: &mut Checkpoints,
-        mut on_loss: impl FnMut(u64, &[f32]),
+        on_loss: impl FnMut(u64, &[f32]),
     ) -> Result<(), DiffusionError> {
         self.check_data(data)?;
         if let Some((_, state, path)) = checkpoints.restore() {
             self.restore(&state, &path)?;
         }
+        let (schedule, highest) = (self.config.schedule, self.config.learning_rate);
+        let rate = |step| match schedule {
+            Schedule::Constant => highest,
+            Schedule::Cosine => cosine_decay(highest, step, steps),
+        };
+        self.advance(data, steps, rate, checkpoints, on_loss)
+    }
+
+    /// Takes steps until there are `steps`, step t with the learning rate `rate(t)`.
+    pub(crate) fn advance(
+        &mut self,
+        data: &[ScoreData],
+        steps: u64,
+        rate: impl Fn(u64) -> f64 + Sync,
+        checkpoints: &mut Checkpoints,
+        mut on_loss: impl FnMut(u64, &[f32]),
+    ) -> Result<(), DiffusionError> {
         let progress = Progress::new(format!("train {}", self.name), steps.saturating_sub(self.step), "steps");
         let (mut sum, mut count) = (None, 0u64);
         let device = self.network.net().device();
@@ -176,7 +207,7 @@ impl Trainer {
             }
             let so_far = sum.take();
             sum = Some(on_threads_of(&device, || {
-                let loss = self.step(data, steps);
+                let loss = self.step(data, rate(self.step));
                 match so_far {
                     None => loss,
                     Some(sum) => sum + loss,
@@ -202,7 +233,7 @@ impl Trainer {
         Ok(())
     }
 
-    fn check_data(&self, data: &[ScoreData]) -> Result<(), DiffusionError> {
+    pub(crate) fn check_data(&self, data: &[ScoreData]) -> Result<(), DiffusionError> {
         if data.len() != 1 && data.len() != self.members.len() {
             return Err(DiffusionError::input("data sets", data.len(), format!("1, or {}", self.members.len())));
         }
@@ -217,13 +248,10 @@ impl Trainer {
     }
 
     /// One step of Adam; the loss of each member, `[P, 1, 1]`.
-    fn step(&mut self, data: &[ScoreData], steps: u64) -> Tensor<3> {
-        let loss = denoising_loss(self.network.net(), self.batch(data));
+    fn step(&mut self, data: &[ScoreData], rate: f64) -> Tensor<3> {
+        let batch = self.batch(data, &format!("train/{}", self.name), self.step);
+        let loss = denoising_loss(self.network.net(), batch);
         let detached = loss.clone().inner();
-        let rate = match self.config.schedule {
-            Schedule::Constant => self.config.learning_rate,
-            Schedule::Cosine => cosine_decay(self.config.learning_rate, self.step, steps),
-        };
         match &mut self.average {
             None => self.network.step(loss.sum(), rate),
             Some(average) => {
@@ -236,15 +264,16 @@ impl Trainer {
         detached
     }
 
-    /// The batch of the next step. Its streams are indexed by the step: a restored training continues the same draws.
-    fn batch(&self, data: &[ScoreData]) -> Batch {
+    /// Batch `index` of the stream `name`. The batches of a training are indexed by the step: a restored training continues the
+    /// same draws.
+    fn batch(&self, data: &[ScoreData], name: &str, index: u64) -> Batch {
         let (p, b, d, c) = (self.members.len(), self.config.batch, self.spec.dims, self.spec.condition);
         let (mut x, mut target) = (Vec::with_capacity(p * b * d), Vec::with_capacity(p * b * d));
         let (mut time, mut condition) = (Vec::with_capacity(p * b), Vec::with_capacity(p * b * c));
         let mut z = vec![0.0; d];
         for (m, streams) in self.members.iter().enumerate() {
             let data = &data[if data.len() == 1 { 0 } else { m }];
-            let mut rng = streams.indexed(&format!("train/{}", self.name), self.step);
+            let mut rng = streams.indexed(name, index);
             for i in 0..b {
                 let (row, on) = data.draw(&mut rng, i);
                 let level = self.process.draw(&mut rng);
@@ -268,13 +297,35 @@ impl Trainer {
         Batch { x: tensor(x, d), time: tensor(time, 1), condition: tensor(condition, c), target: tensor(target, d) }
     }
 
-    /// The model as it is: the moving average if there is one.
-    pub fn model(&self) -> ScoreModel {
-        let network = match &self.average {
+    /// What samples: the moving average if there is one.
+    fn sampling_network(&self) -> ScoreNetwork {
+        match &self.average {
             Some(average) => average.net().clone(),
             None => self.network.net().valid(),
-        };
-        ScoreModel::new(self.spec, self.process, network)
+        }
+    }
+
+    /// The model as it is: the moving average if there is one.
+    pub fn model(&self) -> ScoreModel {
+        ScoreModel::new(self.spec, self.process, self.sampling_network())
+    }
+
+    /// The loss of every member on rows that it may not have seen, of the network that samples: the mean over `batches` batches,
+    /// which are the same at every call, so that two calls differ by the networks alone.
+    pub fn loss_on(&self, data: &[ScoreData], batches: u64) -> Result<Vec<f64>, DiffusionError> {
+        self.check_data(data)?;
+        let network = self.sampling_network();
+        let name = format!("held out/{}", self.name);
+        let mut sums = vec![0.0; self.members.len()];
+        for index in 0..batches {
+            let mut batch = self.batch(data, &name, index);
+            for part in [&mut batch.x, &mut batch.time, &mut batch.condition, &mut batch.target] {
+                *part = part.clone().inner();
+            }
+            let losses = on_threads_of(&network.device(), || host(denoising_loss(&network, batch)));
+            sums.iter_mut().zip(losses).for_each(|(sum, loss)| *sum += f64::from(loss));
+        }
+        Ok(sums.into_iter().map(|sum| sum / batches as f64).collect())
     }
 
     /// Everything a continuation needs besides the arguments of [`Trainer::new`].
@@ -285,6 +336,7 @@ impl Trainer {
             out.collect("average", average.net());
         }
         out.metadata.insert("step".to_owned(), self.step.to_string());
+        self.found.keep(&mut out);
         out
     }
 
@@ -303,6 +355,7 @@ impl Trainer {
         if let Some(average) = &mut self.average {
             average.load("average", state, path)?;
         }
+        self.found = Found::restored(state, path)?;
         Ok(())
     }
 }

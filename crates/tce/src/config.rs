@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
-use tce_diffusion::{Process, Sampler, Schedule, Target};
+use tce_diffusion::{Process, Sampler, Schedule, Target, UntilDone};
 use tce_learn::{
     BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDtConfig, Mode,
     OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
@@ -54,8 +54,11 @@ pub struct GeneratorConfig {
     pub process: Process,
     pub sampler: Sampler,
     pub target: Target,
-    pub state_steps: u64,
-    pub transition_steps: u64,
+    pub state_steps: Length,
+    pub transition_steps: Length,
+    /// Runs that were done before there was this table have fixed lengths.
+    #[serde(default)]
+    pub until_done: UntilDoneConfig,
     pub batch: usize,
     pub learning_rate: f64,
     pub schedule: Schedule,
@@ -64,6 +67,84 @@ pub struct GeneratorConfig {
     pub source_states: bool,
     pub y_max: f32,
     pub rows: usize,
+}
+
+/// How long a score network is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Length {
+    /// So many updates.
+    Steps(u64),
+    /// `"auto"`: until it no longer helps ([`UntilDoneConfig`]).
+    Auto,
+}
+
+impl Serialize for Length {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
+        match self {
+            Length::Steps(steps) => to.serialize_u64(*steps),
+            Length::Auto => to.serialize_str("auto"),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Length {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<Self, D::Error> {
+        struct Visitor;
+        impl serde::de::Visitor<'_> for Visitor {
+            type Value = Length;
+            fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+                f.write_str("a number of updates, or \"auto\"")
+            }
+            fn visit_u64<E>(self, steps: u64) -> std::result::Result<Length, E> {
+                Ok(Length::Steps(steps))
+            }
+            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> std::result::Result<Length, E> {
+                let negative = |_| E::invalid_value(serde::de::Unexpected::Signed(steps), &self);
+                u64::try_from(steps).map(Length::Steps).map_err(negative)
+            }
+            fn visit_str<E: serde::de::Error>(self, word: &str) -> std::result::Result<Length, E> {
+                match word {
+                    "auto" => Ok(Length::Auto),
+                    _ => Err(E::invalid_value(serde::de::Unexpected::Str(word), &self)),
+                }
+            }
+        }
+        from.deserialize_any(Visitor)
+    }
+}
+
+/// When a network whose length is `"auto"` is done.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct UntilDoneConfig {
+    /// Updates of the first cycle; every further one is twice as long.
+    pub first: u64,
+    /// Updates that all cycles of q_mix together may take.
+    pub state_limit: u64,
+    /// Updates that all cycles of q_tran together may take.
+    pub transition_limit: u64,
+    /// Share by which the held-out loss has to fall in a cycle for another one to follow.
+    pub gain: f64,
+    /// Share of the target rows that is held out.
+    pub held_out: f64,
+}
+
+impl Default for UntilDoneConfig {
+    fn default() -> Self {
+        Self { first: 7_500, state_limit: 60_000, transition_limit: 120_000, gain: 0.05, held_out: 0.05 }
+    }
+}
+
+impl UntilDoneConfig {
+    /// The plan of q_mix.
+    pub fn state(&self) -> UntilDone {
+        UntilDone { first: self.first, limit: self.state_limit, gain: self.gain }
+    }
+
+    /// The plan of q_tran.
+    pub fn transition(&self) -> UntilDone {
+        UntilDone { first: self.first, limit: self.transition_limit, gain: self.gain }
+    }
 }
 
 /// Z-score filtering (Eq. 8).
@@ -342,6 +423,11 @@ impl Config {
         };
         within("generator.y_max", self.generator.y_max.into(), 0.0, 1.0)?;
         within("generator.ema", self.generator.ema, 0.0, 0.999_999)?;
+        let until_done = &self.generator.until_done;
+        within("generator.until_done.held_out", until_done.held_out, 0.001, 0.5)?;
+        for plan in [until_done.state(), until_done.transition()] {
+            plan.check().map_err(|e| Error::Usage(format!("generator.until_done: {e}")))?;
+        }
         within("mixture.lambda", self.mixture.lambda, 0.0, 1.0)?;
         within("learner.top", self.learner.top, 0.001, 1.0)?;
         within("filter.z_threshold", self.filter.z_threshold, 0.1, 1e9)?;

@@ -7,15 +7,16 @@
 use std::sync::{Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
+use tce_base::random::choose;
 use tce_base::{Progress, Streams};
 use tce_data::Transitions;
 use tce_diffusion::{
-    Chunks, Condition, DiffusionError, NetworkConfig, Part, Process, Request, Sampler, Schedule, ScoreData, ScoreModel,
-    Target, TrainConfig, Trainer, uniform_labels,
+    Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Process, Request, Sampler, Schedule, ScoreData,
+    ScoreModel, Target, TrainConfig, Trainer, UntilDone, uniform_labels,
 };
 use tce_nn::{Checkpoints, Device, is_cpu};
 
-use crate::config::GeneratorConfig;
+use crate::config::{GeneratorConfig, Length, UntilDoneConfig};
 use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::metrics::Metrics;
@@ -41,6 +42,12 @@ pub struct Trained {
     pub state_loss: Vec<f32>,
     /// Last reported loss of q_tran, per member.
     pub transition_loss: Vec<f32>,
+    /// Held-out losses at the ends of q_mix's cycles; empty where its length was given.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub state_curve: Vec<CycleEnd>,
+    /// Held-out losses at the ends of q_tran's cycles; empty where its length was given.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub transition_curve: Vec<CycleEnd>,
     /// Seconds of training, all members together.
     pub seconds: f64,
 }
@@ -52,8 +59,10 @@ struct TrainingSpec<'a> {
     seeds: &'a [u64],
     process: Process,
     target: Target,
-    state_steps: u64,
-    transition_steps: u64,
+    state_steps: Length,
+    transition_steps: Length,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    until_done: Option<UntilDoneConfig>,
     batch: usize,
     learning_rate: f64,
     schedule: Schedule,
@@ -79,6 +88,7 @@ impl Generator {
             target: g.target,
             state_steps: g.state_steps,
             transition_steps: g.transition_steps,
+            until_done: [g.state_steps, g.transition_steps].contains(&Length::Auto).then_some(g.until_done),
             batch: g.batch,
             learning_rate: g.learning_rate,
             schedule: g.schedule,
@@ -103,7 +113,10 @@ impl Generator {
         trained.seconds = started.elapsed().as_secs_f64();
         generator.state.save(&attempt.file(files[0]))?;
         generator.transition.save(&attempt.file(files[1]))?;
-        attempt.finish(&files.map(String::from), &trained)?;
+        let cycles = trained.state_curve.iter().map(|end| cycle_file("state", end.step));
+        let cycles = cycles.chain(trained.transition_curve.iter().map(|end| cycle_file("transition", end.step)));
+        let files: Vec<_> = files.into_iter().map(String::from).chain(cycles).collect();
+        attempt.finish(&files, &trained)?;
         Ok((generator, stage, trained))
     }
 
@@ -122,12 +135,21 @@ impl Generator {
         let d = units.live.len();
         let train = TrainConfig { learning_rate: g.learning_rate, schedule: g.schedule, batch: g.batch, ema: g.ema };
         let (s, s2) = (units.take(&target.observations), units.take(&target.next_observations));
-        let target_states = units.state.apply(&s);
+        let all_states = units.state.apply(&s);
+        // Rows that tell when to stop are seen by neither network.
+        let auto = [g.state_steps, g.transition_steps].contains(&Length::Auto);
+        let share = if auto { g.until_done.held_out } else { 0.0 };
+        let (kept, held_out) = hold_out_runs(target.len(), share);
+        let pick = |rows: &[f32], of: &[usize]| -> Vec<f32> {
+            of.iter().flat_map(|&i| rows[i * d..(i + 1) * d].iter().copied()).collect()
+        };
+        let (target_states, held_out_states) = (pick(&all_states, &kept), pick(&all_states, &held_out));
 
         // q_mix: the label says whose state it is (Eq. 5). q_tran: target rows alone. Neither needs the other, so they
         // train side by side where there are two threads.
         let source_states = source.map(|t| units.states(&t.observations)).unwrap_or_default();
-        let outputs = units.output.apply(&g.target.encode(&s, &s2));
+        let all_outputs = units.output.apply(&g.target.encode(&s, &s2));
+        let (outputs, held_out_outputs) = (pick(&all_outputs, &kept), pick(&all_outputs, &held_out));
         let state_data = match source {
             Some(_) => ScoreData::labelled(&source_states, &target_states, d, g.balanced)?,
             None => {
@@ -136,6 +158,21 @@ impl Generator {
             }
         };
         let transition_data = ScoreData::conditioned(&outputs, d, &target_states, d)?;
+        let label = Condition::Constant(vec![0.0]);
+        let state_course = match g.state_steps {
+            Length::Steps(steps) => Course::Steps(steps),
+            Length::Auto => Course::UntilDone {
+                plan: g.until_done.state(),
+                probe: ScoreData::new(vec![Part { rows: &held_out_states, condition: label }], d, 1, false)?,
+            },
+        };
+        let transition_course = match g.transition_steps {
+            Length::Steps(steps) => Course::Steps(steps),
+            Length::Auto => Course::UntilDone {
+                plan: g.until_done.transition(),
+                probe: ScoreData::conditioned(&held_out_outputs, d, &held_out_states, d)?,
+            },
+        };
         let mut state = Trainer::new("state", NetworkConfig::new(d, 1), g.process, train, &members, device)?;
         let mut transition = Trainer::new("transition", NetworkConfig::new(d, d), g.process, train, &members, device)?;
         transition.stop_with(&state);
@@ -145,30 +182,37 @@ impl Generator {
             "state" => at <= state_step,
             _ => at <= transition_step,
         })?);
-        let mut state_run = || run(&mut state, &state_data, g.state_steps, &mut kept_state, &metrics, "state");
+        let mut state_run = || run(&mut state, &state_data, &state_course, &mut kept_state, &metrics, "state", attempt);
         let mut transition_run = || {
-            let steps = g.transition_steps;
-            run(&mut transition, &transition_data, steps, &mut kept_transition, &metrics, "transition")
+            let (data, course) = (&transition_data, &transition_course);
+            run(&mut transition, data, course, &mut kept_transition, &metrics, "transition", attempt)
         };
         // A GPU has one thread that queues for it.
-        let (state_loss, transition_loss) = if is_cpu(device) && rayon::current_num_threads() > 1 {
+        let (state, transition) = if is_cpu(device) && rayon::current_num_threads() > 1 {
             std::thread::scope(|scope| {
                 let other = scope.spawn(transition_run);
-                let state_loss = state_run();
-                (state_loss, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                let state = state_run();
+                (state, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
             })
         } else {
             (state_run(), transition_run())
         };
-        let (state_loss, transition_loss) = match (state_loss, transition_loss) {
+        let (state, transition) = match (state, transition) {
             // The one that diverged is the reason, not the one that was stopped for it.
             (Err(Error::Diffusion(DiffusionError::Interrupted { .. })), Err(reason)) | (Err(reason), _) => {
                 return Err(reason);
             }
             (Ok(state), transition) => (state, transition?),
         };
-        let trained = Trained { units: units.clone(), state_loss, transition_loss, seconds: 0.0 };
-        Ok((Self { units, state: state.model(), transition: transition.model() }, trained))
+        let trained = Trained {
+            units: units.clone(),
+            state_loss: state.loss,
+            transition_loss: transition.loss,
+            state_curve: state.curve,
+            transition_curve: transition.curve,
+            seconds: 0.0,
+        };
+        Ok((Self { units, state: state.model, transition: transition.model }, trained))
     }
 
     /// Samples `rows` states per member under ŷ ~ U(0, y_max): live dimensions in the data's units, `[P, rows, d]`.
@@ -267,25 +311,110 @@ pub(crate) fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress 
     Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
 }
 
-/// Trains, and keeps the losses; the last ones come back.
+/// The file of the network as it was at the end of a cycle.
+pub fn cycle_file(name: &str, step: u64) -> String {
+    format!("{name}-{step}.safetensors")
+}
+
+/// Rows that follow each other and are held out together: neighbours in time are too much alike for one to test the other.
+const HELD_OUT_RUN: usize = 25;
+
+/// The rows of `n` to train on, and the share that is held out, in runs at random places; both ascending. The same for all seeds.
+fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
+    let runs = n.div_ceil(HELD_OUT_RUN);
+    let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
+    let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
+    (0..n).partition(|i| chosen.binary_search(&(i / HELD_OUT_RUN)).is_err())
+}
+
+/// How long a network is trained.
+pub(crate) enum Course<'a> {
+    /// So many updates.
+    Steps(u64),
+    /// Until its loss on rows that it does not see no longer falls.
+    UntilDone {
+        /// The cycles.
+        plan: UntilDone,
+        /// The rows.
+        probe: ScoreData<'a>,
+    },
+}
+
+/// A network that was trained.
+pub(crate) struct Ready {
+    /// The network.
+    pub model: ScoreModel,
+    /// Last reported loss, per member.
+    pub loss: Vec<f32>,
+    /// Held-out losses at the ends of the cycles.
+    pub curve: Vec<CycleEnd>,
+}
+
+/// Batches of a loss that tells when to stop: 8192 draws of a row, a noise level and noise at 128 rows a batch.
+const PROBE_BATCHES: u64 = 64;
+
+/// Trains, and keeps the losses and, where there are cycles, the network at the end of each of them.
 pub(crate) fn run(
     trainer: &mut Trainer,
     data: &ScoreData,
-    steps: u64,
+    course: &Course,
     checkpoints: &mut Checkpoints,
     metrics: &Mutex<Metrics>,
     name: &str,
-) -> Result<Vec<f32>> {
-    let mut last = Vec::new();
-    trainer.train(std::slice::from_ref(data), steps, checkpoints, |step, losses| {
-        last = losses.to_vec();
-        if step % 500 == 0 || step == steps {
-            let mut metrics = metrics.lock().unwrap_or_else(PoisonError::into_inner);
-            for (m, &loss) in losses.iter().enumerate() {
-                // A metric that cannot be written must not cost the training.
-                let _ = metrics.log(name, step, m, [("loss", loss as f64)]);
-            }
+    attempt: &Attempt,
+) -> Result<Ready> {
+    let data = std::slice::from_ref(data);
+    let log = |step: u64, figure: &'static str, values: &[f64]| {
+        let mut metrics = metrics.lock().unwrap_or_else(PoisonError::into_inner);
+        for (m, &value) in values.iter().enumerate() {
+            // A metric that cannot be written must not cost the training.
+            let _ = metrics.log(name, step, m, [(figure, value)]);
         }
-    })?;
-    Ok(last)
+    };
+    let mut loss = Vec::new();
+    let end = match course {
+        Course::Steps(steps) => Some(*steps),
+        Course::UntilDone { .. } => None,
+    };
+    let on_loss = |step: u64, losses: &[f32]| {
+        loss = losses.to_vec();
+        if step.is_multiple_of(500) || Some(step) == end {
+            log(step, "loss", &losses.iter().map(|&l| f64::from(l)).collect::<Vec<_>>());
+        }
+    };
+    let (model, curve) = match course {
+        Course::Steps(steps) => {
+            trainer.train(data, *steps, checkpoints, on_loss)?;
+            (trainer.model(), Vec::new())
+        }
+        Course::UntilDone { plan, probe } => {
+            let judge = |trainer: &Trainer| -> Result<Vec<f64>> {
+                let held_out = trainer.loss_on(std::slice::from_ref(probe), PROBE_BATCHES)?;
+                log(trainer.steps(), "training_loss", &trainer.loss_on(data, PROBE_BATCHES)?);
+                log(trainer.steps(), "held_out_loss", &held_out);
+                trainer.model().save(&attempt.file(&cycle_file(name, trainer.steps())))?;
+                Ok(held_out)
+            };
+            trainer.train_until_done(data, plan, checkpoints, on_loss, judge)?
+        }
+    };
+    Ok(Ready { model, loss, curve })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn held_out_rows_come_in_runs_and_are_the_share() {
+        let (kept, held_out) = hold_out_runs(5000, 0.05);
+        assert_eq!((kept.len(), held_out.len()), (4750, 250));
+        assert!(held_out.chunks(HELD_OUT_RUN).all(|run| run[0] % HELD_OUT_RUN == 0 && run[24] == run[0] + 24));
+        let mut all = [kept, held_out].concat();
+        all.sort_unstable();
+        assert_eq!(all, (0..5000).collect::<Vec<_>>());
+        assert_eq!(hold_out_runs(100, 0.0), ((0..100).collect(), vec![]));
+        let (kept, held_out) = hold_out_runs(60, 0.01);
+        assert!(!held_out.is_empty() && kept.len() >= 35, "at least one run, never all");
+    }
 }

@@ -36,7 +36,7 @@ use tce_nn::{Device, NamedParameters, cpu};
 use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig};
 use crate::error::{Error, Result};
 use crate::expand::{Expansion, Generated};
-use crate::generator::{progress, run, start_rows};
+use crate::generator::{Course, Ready, progress, run, start_rows};
 use crate::inputs::{InputSpec, Inputs};
 use crate::stage::Stage;
 
@@ -301,8 +301,8 @@ fn train(
     let mut checkpoints = attempt.checkpoints("joint")?;
     let from = checkpoints.step().unwrap_or(0);
     let metrics = Mutex::new(attempt.metrics(|_, at| at <= from)?);
-    let loss = run(&mut trainer, &data, j.steps, &mut checkpoints, &metrics, "joint")?;
-    let model = trainer.model();
+    let ready = run(&mut trainer, &data, &Course::Steps(j.steps), &mut checkpoints, &metrics, "joint", &attempt)?;
+    let Ready { model, loss, .. } = ready;
     model.save(&attempt.file(file))?;
     let scores = on.map(|(units, _)| units);
     let trained = Trained { units, scores, loss, seconds: started.elapsed().as_secs_f64() };

@@ -41,7 +41,7 @@ fn gradients_follow_finite_differences() {
     let data = [ScoreData::conditioned(&x, 3, &c, 2).unwrap()];
     for process in [Process::Ve(Ve::default()), Process::Vp(Vp::default()), Process::Edm(Edm::default())] {
         let trainer = Trainer::new("t", small(), process, TrainConfig::default(), &[Streams::new(3)], &cpu()).unwrap();
-        let loss = denoising_loss(trainer.network.net(), trainer.batch(&data));
+        let loss = denoising_loss(trainer.network.net(), trainer.batch(&data, "train/t", trainer.step));
         let grads = loss.sum().backward();
         let mut collected = Collected { path: vec!["n".into()], grads: &grads, out: BTreeMap::new() };
         trainer.network.net().visit(&mut collected);
@@ -61,7 +61,7 @@ fn gradients_follow_finite_differences() {
                 let values = &mut moved.tensors.get_mut(name).unwrap().1;
                 values.iter_mut().zip(&v).for_each(|(p, v)| *p += sign * h * v);
                 let network = moved.apply("n", trainer.network.net().clone(), Path::new("t")).unwrap();
-                host(denoising_loss(&network, trainer.batch(&data)))[0] as f64
+                host(denoising_loss(&network, trainer.batch(&data, "train/t", trainer.step)))[0] as f64
             };
             let difference = (at(1.0) - at(-1.0)) / (2.0 * h as f64);
             let exact: f64 = grad.iter().zip(&v).map(|(g, v)| *g as f64 * *v as f64).sum();

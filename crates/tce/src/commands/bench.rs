@@ -9,6 +9,7 @@ use tce_base::{set_quiet, write_json};
 use tce_nn::Device;
 
 use crate::bench::{Measured, On, measure, names};
+use crate::config::Length;
 use crate::error::{Error, Result};
 use crate::layers::{Layered, Preset};
 use crate::output::{Output, table};
@@ -115,7 +116,15 @@ fn whole_task(measured: &[Measured]) -> Result<Option<WholeTask>> {
         return Ok(None);
     };
     // Two threads train the two networks side by side.
-    let (a, b) = (g.state_steps as f64 / score, g.transition_steps as f64 / score);
+    // A network that trains until it is done takes as long as its limit at most.
+    let steps = |length: Length, limit: u64| match length {
+        Length::Steps(steps) => steps as f64,
+        Length::Auto => limit as f64,
+    };
+    let (a, b) = (
+        steps(g.state_steps, g.until_done.state_limit) / score,
+        steps(g.transition_steps, g.until_done.transition_limit) / score,
+    );
     let score_training = if rayon::current_num_threads() > 1 { a.max(b) } else { a + b };
     let (label_models, behaviour_model) =
         (config.labels.training.steps as f64 / labels, config.learner.behaviour.cvae.steps as f64 / cvae);
