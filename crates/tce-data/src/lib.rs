@@ -9,6 +9,8 @@
 //! | In which units does a network see it? | [`Standardizer`] |
 //! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
 //! | Which transfer problems are there? | [`Task`] |
+//! | Which trajectories of a mixed set to learn from? | [`choose_trajectories`] |
+//! | Which values can a row have at all? | [`Support`]: bounds, constants, flags, unit vectors |
 //! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
 //! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
 //!
@@ -28,7 +30,9 @@ mod quality;
 mod reference;
 mod rows;
 mod standardise;
+mod support;
 mod task;
+mod trajectories;
 mod transitions;
 mod transport;
 
@@ -44,6 +48,8 @@ pub use quality::Quality;
 pub use reference::{ReferenceScores, ScoreTable, Shift, reference_scores};
 pub use rows::Rows;
 pub use standardise::{RELATIVE_FLOOR, Standardizer};
+pub use support::{Bound, Clip, Constant, Levels, Support, UnitGroup};
 pub use task::{Task, parse_agent, parse_environment};
+pub use trajectories::{CLEAR_GAP, Choice, ENOUGH_ROWS, Measure, choose_trajectories, choose_trajectories_with};
 pub use transitions::{Agent, Episode, Transitions};
 pub use transport::{TransportOptions, transport_costs};

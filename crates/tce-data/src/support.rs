@@ -1,0 +1,569 @@
+//! What the columns of observations respect, and making generated rows respect it too.
+//!
+//! A generative model with smooth outputs leaves values where no sensor ever puts one. [`Support::fit`] finds four kinds
+//! of columns; each column is of one kind at most, the first that fits:
+//!
+//! | kind | found if | [`Support::apply`] |
+//! |---|---|---|
+//! | constant | all rows are equal | puts the constant back |
+//! | few values (flags, counters) | 2 to 8 distinct values in 1000 rows or more | rounds to the nearest of them |
+//! | unit vector: 4 neighbouring columns (a quaternion) or 2 (cosine and sine) | norm 1 within .001 in 99 % of every table's rows, and far steadier than the columns themselves | divides by the norm |
+//! | clipped | an atom at the minimum or the maximum, see [`Clip`] | clamps at that end |
+//!
+//! All other columns keep their bytes. Fewer than 100 rows say nothing.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// The fewest rows from which anything is concluded.
+const LEAST_ROWS: usize = 100;
+/// The fewest rows in which few distinct values mean something, and how many values are few.
+const LEVEL_ROWS: usize = 1000;
+const MOST_LEVELS: usize = 8;
+/// An atom: this many rows, and this share of the rows of a table, at exactly the extreme value.
+const ATOM_ROWS: usize = 5;
+const ATOM_SHARE: f64 = 0.002;
+/// Ordinary values occur at most twice (a table may hold s and s'); this share of the distinct ones has to.
+const ORDINARY_COUNT: usize = 2;
+const ORDINARY_SHARE: f64 = 0.75;
+/// A norm is 1 within this in this share of the rows.
+const NORM_TOLERANCE: f64 = 1e-3;
+const NORM_SHARE: f64 = 0.99;
+/// The squared norm's deviation from 1 (root mean square), relative to what independent columns of the same spread had.
+const NORM_STEADINESS: f64 = 0.05;
+/// What float32 leaves of a normalised vector: within this nothing is done, so that doing it twice changes nothing.
+const NORM_ROUNDING: f64 = 4e-7;
+
+/// A column without any spread.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Constant {
+    /// Which column, from 0.
+    pub column: usize,
+    /// Its value.
+    pub value: f32,
+}
+
+/// A column with few distinct values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Levels {
+    /// Which column, from 0.
+    pub column: usize,
+    /// The values that occur, ascending; 2 to 8.
+    pub values: Vec<f32>,
+}
+
+/// An end at which a column is clipped.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Bound {
+    /// The extreme value, in the column's units.
+    pub value: f32,
+    /// How many rows of all tables have exactly this value.
+    pub rows: usize,
+}
+
+/// A clipped column.
+///
+/// An end is clipped if at least 5 rows and .2 % of the rows of one table have exactly the extreme value of all tables, while
+/// three quarters of that table's other distinct values occur at most twice. An end is also clipped if its extreme value is
+/// exactly plus or minus the bound of a column that was found so: one sensor clips all its columns at the same bound, and
+/// a continuous column practically never ends exactly there. (0 is no such bound.)
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Clip {
+    /// Which column, from 0.
+    pub column: usize,
+    /// The lower bound, if the column is clipped there.
+    pub low: Option<Bound>,
+    /// The upper bound, if the column is clipped there.
+    pub high: Option<Bound>,
+}
+
+/// Neighbouring columns that are a unit vector.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UnitGroup {
+    /// The first column, from 0.
+    pub first: usize,
+    /// How many columns: 4 (a quaternion) or 2 (cosine and sine).
+    pub width: usize,
+}
+
+/// What the columns of some tables respect.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Support {
+    /// Number of columns.
+    pub dim: usize,
+    /// How many rows all tables had together.
+    pub rows: usize,
+    /// Columns without any spread, ascending.
+    pub constants: Vec<Constant>,
+    /// Columns with few distinct values, ascending.
+    pub levels: Vec<Levels>,
+    /// Unit vectors, ascending, without overlaps.
+    pub units: Vec<UnitGroup>,
+    /// Clipped columns, ascending.
+    pub clips: Vec<Clip>,
+}
+
+impl Support {
+    /// Looks at row-major `tables` of `dim` columns each (s and s' are tables of their own). What is found holds in all
+    /// tables together; an atom in one table is enough, so that a large source does not hide a small target.
+    ///
+    /// Columns with NaN or infinity are left alone.
+    ///
+    /// # Panics
+    /// If a table is not rectangular.
+    pub fn fit(tables: &[&[f32]], dim: usize) -> Self {
+        assert!(tables.iter().all(|t| t.len() % dim.max(1) == 0), "the tables are not rows of {dim}");
+        let rows = tables.iter().map(|t| t.len() / dim.max(1)).sum();
+        let mut out =
+            Support { dim, rows, constants: Vec::new(), levels: Vec::new(), units: Vec::new(), clips: Vec::new() };
+        if rows < LEAST_ROWS || dim == 0 {
+            return out;
+        }
+        let columns: Vec<Column> = (0..dim).into_par_iter().map(|d| Column::scan(tables, dim, d)).collect();
+        let mut free: Vec<bool> = columns.iter().map(|c| c.finite).collect();
+        for (column, c) in columns.iter().enumerate().filter(|(_, c)| c.finite) {
+            match c.levels.len() {
+                1 => out.constants.push(Constant { column, value: c.levels[0] }),
+                2..=MOST_LEVELS if rows >= LEVEL_ROWS => out.levels.push(Levels { column, values: c.levels.clone() }),
+                _ => continue,
+            }
+            free[column] = false;
+        }
+        out.units = unit_groups(tables, dim, &free);
+        for group in &out.units {
+            free[group.first..group.first + group.width].fill(false);
+        }
+        out.clips = clips(tables, dim, &columns, &free);
+        out
+    }
+
+    /// Makes row-major `rows` respect it, where they stand. Doing it twice changes nothing more; NaN stays NaN (outside of
+    /// constant columns), a vector without length stays as it is.
+    ///
+    /// # Panics
+    /// If `rows` is not rectangular.
+    pub fn apply(&self, rows: &mut [f32]) {
+        assert_eq!(rows.len() % self.dim.max(1), 0, "not rows of {}", self.dim);
+        for row in rows.chunks_exact_mut(self.dim.max(1)) {
+            for c in &self.constants {
+                // -0 and 0 are the same value: bytes of right values stay.
+                if row[c.column] != c.value {
+                    row[c.column] = c.value;
+                }
+            }
+            for c in &self.levels {
+                row[c.column] = nearest(&c.values, row[c.column]);
+            }
+            for g in &self.units {
+                normalise(&mut row[g.first..g.first + g.width]);
+            }
+            for c in &self.clips {
+                let x = &mut row[c.column];
+                match (c.low, c.high) {
+                    (Some(low), _) if *x < low.value => *x = low.value,
+                    (_, Some(high)) if *x > high.value => *x = high.value,
+                    _ => {}
+                }
+            }
+        }
+    }
+
+    /// Whether nothing was found: [`Support::apply`] changes nothing.
+    pub fn is_empty(&self) -> bool {
+        self.constants.is_empty() && self.levels.is_empty() && self.units.is_empty() && self.clips.is_empty()
+    }
+
+    /// One sentence for every finding. Neighbouring columns with the same constant are one finding. Columns count from 0.
+    pub fn describe(&self) -> Vec<String> {
+        let mut out = Vec::new();
+        let same = |a: &Constant, b: &Constant| a.column + 1 == b.column && a.value == b.value;
+        for run in self.constants.chunk_by(same) {
+            let value = run[0].value + 0.0;
+            match (run.first(), run.last()) {
+                (Some(a), Some(b)) if a.column < b.column => {
+                    out.push(format!("Columns {} to {} are always {value}: put back to it.", a.column, b.column));
+                }
+                _ => out.push(format!("Column {} is always {value}: put back to it.", run[0].column)),
+            }
+        }
+        for c in &self.levels {
+            let values: Vec<String> = c.values.iter().map(f32::to_string).collect();
+            out.push(format!(
+                "Column {} has only the values {}: rounded to the nearest of them.",
+                c.column,
+                values.join(", ")
+            ));
+        }
+        for g in &self.units {
+            out.push(match g.width {
+                4 => format!("Columns {} to {} are a unit quaternion: normalised.", g.first, g.first + 3),
+                _ => format!("Columns {} and {} lie on the unit circle: normalised.", g.first, g.first + 1),
+            });
+        }
+        for c in &self.clips {
+            let ends: Vec<String> = [c.low, c.high]
+                .iter()
+                .flatten()
+                .map(|b| {
+                    format!("at {} ({:.2} % of the rows)", b.value, 100.0 * b.rows as f64 / self.rows.max(1) as f64)
+                })
+                .collect();
+            out.push(format!("Column {} is clipped {}: clamped there.", c.column, ends.join(" and ")));
+        }
+        out
+    }
+}
+
+/// What one pass over a column tells.
+struct Column {
+    finite: bool,
+    min: f32,
+    max: f32,
+    /// The distinct values, ascending, as long as there are at most [`MOST_LEVELS`]; otherwise one more.
+    levels: Vec<f32>,
+}
+
+impl Column {
+    fn scan(tables: &[&[f32]], dim: usize, column: usize) -> Column {
+        let mut c = Column { finite: true, min: f32::INFINITY, max: f32::NEG_INFINITY, levels: Vec::new() };
+        for &x in tables.iter().flat_map(|t| values(t, dim, column)) {
+            if !x.is_finite() {
+                c.finite = false;
+                break;
+            }
+            (c.min, c.max) = (c.min.min(x), c.max.max(x));
+            if c.levels.len() <= MOST_LEVELS && !c.levels.contains(&x) {
+                c.levels.push(x);
+            }
+        }
+        c.levels.sort_by(f32::total_cmp);
+        c
+    }
+}
+
+fn values<'a>(table: &'a [f32], dim: usize, column: usize) -> impl Iterator<Item = &'a f32> {
+    table.iter().skip(column).step_by(dim)
+}
+
+/// The nearest of `values` (ascending); the smaller one of two that are equally near. NaN stays.
+fn nearest(values: &[f32], x: f32) -> f32 {
+    if x.is_nan() || values.contains(&x) {
+        return x;
+    }
+    let distance = |v: f32| (v as f64 - x as f64).abs();
+    values.iter().copied().reduce(|best, v| if distance(v) < distance(best) { v } else { best }).unwrap_or(x)
+}
+
+fn normalise(vector: &mut [f32]) {
+    let norm = squared_norm(vector).sqrt();
+    if !norm.is_finite() || norm == 0.0 || (norm - 1.0).abs() <= NORM_ROUNDING {
+        return;
+    }
+    vector.iter_mut().for_each(|x| *x = (*x as f64 / norm) as f32);
+}
+
+fn squared_norm(vector: &[f32]) -> f64 {
+    vector.iter().map(|&x| (x as f64).powi(2)).sum()
+}
+
+/// All windows of `free` columns that are unit vectors; of overlapping ones those whose norm is steadiest.
+fn unit_groups(tables: &[&[f32]], dim: usize, free: &[bool]) -> Vec<UnitGroup> {
+    let windows: Vec<UnitGroup> = [4, 2]
+        .into_iter()
+        .flat_map(|width| (0..=dim.saturating_sub(width)).map(move |first| UnitGroup { first, width }))
+        .filter(|g| g.first + g.width <= dim && free[g.first..g.first + g.width].iter().all(|f| *f))
+        .collect();
+    let mut found: Vec<(f64, UnitGroup)> =
+        windows.into_par_iter().filter_map(|g| Some((deviation(tables, dim, g)?, g))).collect();
+    found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.first.cmp(&b.1.first)));
+    let mut out: Vec<UnitGroup> = Vec::new();
+    for (_, g) in found {
+        if out.iter().all(|o| o.first + o.width <= g.first || g.first + g.width <= o.first) {
+            out.push(g);
+        }
+    }
+    out.sort_by_key(|g| g.first);
+    out
+}
+
+/// Root mean square of the squared norm's deviation from 1, if the columns are a unit vector.
+fn deviation(tables: &[&[f32]], dim: usize, group: UnitGroup) -> Option<f64> {
+    let (mut within, mut squares) = (0usize, 0.0f64);
+    let mut sums = [(0.0f64, 0.0f64); 4];
+    for table in tables {
+        let rows = table.len() / dim;
+        let may_fail = ((1.0 - NORM_SHARE) * rows as f64) as usize;
+        let mut failed = 0;
+        for row in table.chunks_exact(dim) {
+            let vector = &row[group.first..group.first + group.width];
+            let square = squared_norm(vector);
+            if (square.sqrt() - 1.0).abs() > NORM_TOLERANCE {
+                failed += 1;
+                if failed > may_fail {
+                    return None;
+                }
+                continue;
+            }
+            within += 1;
+            squares += (square - 1.0).powi(2);
+            for (sum, &x) in sums.iter_mut().zip(vector) {
+                let x2 = (x as f64).powi(2);
+                *sum = (sum.0 + x2, sum.1 + x2 * x2);
+            }
+        }
+    }
+    let n = within as f64;
+    let deviation = (squares / n).sqrt();
+    let independent: f64 = sums.iter().map(|s| (s.1 / n - (s.0 / n).powi(2)).max(0.0)).sum();
+    (within > 0 && deviation <= NORM_STEADINESS * independent.sqrt()).then_some(deviation)
+}
+
+/// Clipped columns among the `free` ones.
+fn clips(tables: &[&[f32]], dim: usize, columns: &[Column], free: &[bool]) -> Vec<Clip> {
+    let candidates: Vec<usize> = (0..dim).filter(|&d| free[d]).collect();
+    // Per candidate and end: rows at the extreme, and whether they are an atom.
+    let ends: Vec<[(Bound, bool); 2]> = candidates
+        .par_iter()
+        .map(|&d| [columns[d].min, columns[d].max].map(|extreme| atom(tables, dim, d, extreme)))
+        .collect();
+    let bounds: Vec<f32> =
+        ends.iter().flatten().filter(|(b, atom)| *atom && b.value != 0.0).map(|(b, _)| b.value.abs()).collect();
+    let clipped = |(b, atom): (Bound, bool)| (atom || bounds.contains(&b.value.abs())).then_some(b);
+    candidates
+        .into_iter()
+        .zip(ends)
+        .map(|(column, [low, high])| Clip { column, low: clipped(low), high: clipped(high) })
+        .filter(|c| c.low.is_some() || c.high.is_some())
+        .collect()
+}
+
+/// How many rows have exactly the `extreme` value, and whether that is an atom in one of the tables.
+fn atom(tables: &[&[f32]], dim: usize, column: usize, extreme: f32) -> (Bound, bool) {
+    let mut bound = Bound { value: extreme, rows: 0 };
+    let mut is_atom = false;
+    for table in tables {
+        let rows = table.len() / dim;
+        let at = values(table, dim, column).filter(|x| **x == extreme).count();
+        bound.rows += at;
+        is_atom = is_atom
+            || (at >= ATOM_ROWS
+                && at as f64 >= ATOM_SHARE * rows as f64
+                && mostly_distinct(table, dim, column, extreme));
+    }
+    (bound, is_atom)
+}
+
+/// Whether most distinct values of a column besides `extreme` are ordinary ones.
+fn mostly_distinct(table: &[f32], dim: usize, column: usize, extreme: f32) -> bool {
+    let mut others: Vec<f32> = values(table, dim, column).copied().filter(|x| *x != extreme).collect();
+    others.par_sort_unstable_by(f32::total_cmp);
+    let (mut distinct, mut ordinary) = (0usize, 0usize);
+    for equal in others.chunk_by(|a, b| a == b) {
+        distinct += 1;
+        ordinary += (equal.len() <= ORDINARY_COUNT) as usize;
+    }
+    distinct > MOST_LEVELS && ordinary as f64 >= ORDINARY_SHARE * distinct as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::RngExt;
+    use tce_base::Streams;
+
+    use super::*;
+
+    /// Columns: continuous, clipped at ±10, clipped at the top only, 0.7, a flag, a quaternion (5..=8), continuous, cosine
+    /// and sine (10, 11).
+    const DIM: usize = 12;
+
+    fn table(seed: u64, rows: usize) -> Vec<f32> {
+        let mut rng = Streams::new(seed).stream("rows");
+        let mut out = Vec::new();
+        for _ in 0..rows {
+            let mut u = || rng.random_range(-1.0f32..1.0);
+            let q = [1.0 + 0.3 * u(), 0.4 * u(), 0.4 * u(), u()];
+            let norm = squared_norm(&q).sqrt() as f32;
+            let angle = 0.1 * u();
+            out.extend([
+                3.0 * u(),
+                (12.0 * u()).clamp(-10.0, 10.0),
+                (7.0 * u()).min(6.5),
+                0.7,
+                (u() > 0.0) as u8 as f32,
+            ]);
+            out.extend(q.map(|x| x / norm));
+            out.extend([u(), angle.cos(), angle.sin()]);
+        }
+        out
+    }
+
+    #[test]
+    fn every_kind_is_found_and_nothing_else() {
+        let (a, b) = (table(1, 5000), table(2, 3000));
+        let s = Support::fit(&[&a, &b], DIM);
+        assert_eq!((s.dim, s.rows), (DIM, 8000));
+        assert_eq!(s.constants, [Constant { column: 3, value: 0.7 }]);
+        assert_eq!(s.levels, [Levels { column: 4, values: vec![0.0, 1.0] }]);
+        assert_eq!(s.units, [UnitGroup { first: 5, width: 4 }, UnitGroup { first: 10, width: 2 }]);
+        let ends: Vec<_> =
+            s.clips.iter().map(|c| (c.column, c.low.map(|b| b.value), c.high.map(|b| b.value))).collect();
+        assert_eq!(ends, [(1, Some(-10.0), Some(10.0)), (2, None, Some(6.5))]);
+        let told = s.describe();
+        assert_eq!(told.len(), 6);
+        assert_eq!(told[0], "Column 3 is always 0.7: put back to it.");
+        assert_eq!(told[1], "Column 4 has only the values 0, 1: rounded to the nearest of them.");
+        assert_eq!(told[2], "Columns 5 to 8 are a unit quaternion: normalised.");
+        assert_eq!(told[3], "Columns 10 and 11 lie on the unit circle: normalised.");
+        assert!(
+            told[4].starts_with("Column 1 is clipped at -10 (8.") && told[4].contains(" and at 10 ("),
+            "{}",
+            told[4]
+        );
+        assert!(told[5].ends_with("clamped there."));
+    }
+
+    #[test]
+    fn rows_come_to_respect_it() {
+        let s = Support::fit(&[&table(1, 5000)], DIM);
+        let mut row = [9.0, 11.0, -20.0, 0.6, 0.4, 2.0, 0.0, 0.0, 0.0, 5.0, 0.3, 0.4];
+        s.apply(&mut row);
+        assert_eq!(row, [9.0, 10.0, -20.0, 0.7, 0.0, 1.0, 0.0, 0.0, 0.0, 5.0, 0.6, 0.8]);
+        let mut row = [f32::NAN; DIM];
+        s.apply(&mut row);
+        assert_eq!(row.iter().filter(|x| x.is_nan()).count(), DIM - 1);
+        let mut row = [0.0; DIM];
+        s.apply(&mut row);
+        assert_eq!(row[5..9], [0.0; 4]);
+    }
+
+    /// A rare clip counts if another column shows the bound; a bound of its own does not.
+    #[test]
+    fn one_sensor_clips_all_its_columns_at_the_same_bound() {
+        let mut rng = Streams::new(3).stream("rows");
+        let mut rows: Vec<f32> = (0..5000)
+            .flat_map(|_| {
+                let mut u = || rng.random_range(-1.0f32..1.0);
+                [(11.0 * u()).clamp(-10.0, 10.0), 9.0 * u(), 7.0 * u()]
+            })
+            .collect();
+        (rows[1], rows[2], rows[5]) = (10.0, 8.0, 8.0);
+        let s = Support::fit(&[&rows], 3);
+        assert_eq!(s.clips.len(), 2);
+        assert_eq!(
+            (s.clips[1].column, s.clips[1].low, s.clips[1].high),
+            (1, None, Some(Bound { value: 10.0, rows: 1 }))
+        );
+    }
+
+    /// 20 of 5000 rows of one table are an atom, however many rows the other table has.
+    #[test]
+    fn a_large_table_does_not_hide_an_atom_of_a_small_one() {
+        let mut rng = Streams::new(4).stream("rows");
+        let mut small: Vec<f32> = (0..5000).map(|_| rng.random_range(-1.0..1.0)).collect();
+        small[..20].fill(1.0);
+        let large: Vec<f32> = (0..100_000).map(|_| rng.random_range(-1.0..0.9)).collect();
+        let s = Support::fit(&[&large, &small], 1);
+        assert_eq!(s.clips, [Clip { column: 0, low: None, high: Some(Bound { value: 1.0, rows: 20 }) }]);
+        // Beyond the atom of one table there are values of the other: no bound.
+        let wide: Vec<f32> = large.iter().map(|x| 2.0 * x).collect();
+        assert!(Support::fit(&[&wide, &small], 1).is_empty());
+    }
+
+    #[test]
+    fn steps_counters_and_steady_columns_are_not_mistaken() {
+        // Columns: a counter of steps in episodes of 20; about 1 and about 0 (their norm is 1 by chance); a coarse sensor.
+        let mut rng = Streams::new(5).stream("rows");
+        let rows: Vec<f32> = (0..5000)
+            .flat_map(|i| {
+                let mut u = || rng.random_range(-1.0f32..1.0);
+                [(i % 20) as f32, 1.0 + 3e-4 * u(), 0.01 * u(), (50.0 * u()).round() / 50.0]
+            })
+            .collect();
+        assert!(Support::fit(&[&rows], 4).is_empty());
+        // A circle beside a joint that hardly moves is no quaternion; one-hot flags are no circle.
+        let rows: Vec<f32> = (0..5000)
+            .flat_map(|i| {
+                let mut u = || rng.random_range(-1.0f32..1.0);
+                let angle = 3.0 * u();
+                let flag = (i % 3 == 0) as u8 as f32;
+                [angle.cos(), angle.sin(), 0.01 * u(), 0.01 * u(), flag, 1.0 - flag]
+            })
+            .collect();
+        let s = Support::fit(&[&rows], 6);
+        assert_eq!(s.units, [UnitGroup { first: 0, width: 2 }]);
+        assert_eq!((s.levels.len(), s.clips.len()), (2, 0));
+    }
+
+    #[test]
+    fn little_or_broken_data_say_nothing() {
+        assert!(Support::fit(&[], 3).is_empty());
+        assert!(Support::fit(&[&[]], 0).is_empty());
+        assert!(Support::fit(&[&[1.0; 99]], 1).is_empty());
+        assert_eq!(Support::fit(&[&[1.0; 100]], 1).constants.len(), 1);
+        let mut rows = [1.0; 100];
+        rows[50] = f32::NAN;
+        assert!(Support::fit(&[&rows], 1).is_empty());
+        assert_eq!(Support::fit(&[&[0.0; 300]], 3).describe(), ["Columns 0 to 2 are always 0: put back to it."]);
+    }
+
+    #[test]
+    fn it_survives_json() {
+        let s = Support::fit(&[&table(1, 5000)], DIM);
+        let json = serde_json::to_string(&s).unwrap();
+        assert_eq!(serde_json::from_str::<Support>(&json).unwrap(), s);
+        assert!(serde_json::from_str::<Support>(&json.replace("clips", "clops")).is_err());
+    }
+
+    fn bits(rows: &[f32]) -> Vec<u32> {
+        rows.iter().map(|x| x.to_bits()).collect()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        /// Twice is as good as once, other columns keep their bytes, and bounds hold, for any numbers.
+        #[test]
+        fn applying_is_idempotent_and_touches_nothing_else(
+            rows in prop::collection::vec(prop_oneof![-30f32..30.0, any::<f32>(), Just(-0.0f32), Just(10.0f32)], DIM * 20),
+        ) {
+            let s = Support::fit(&[&table(7, 2000)], DIM);
+            let mut once = rows.clone();
+            s.apply(&mut once);
+            let mut twice = once.clone();
+            s.apply(&mut twice);
+            prop_assert_eq!(bits(&once), bits(&twice));
+            for (before, after) in rows.chunks_exact(DIM).zip(once.chunks_exact(DIM)) {
+                for free in [0, 9] {
+                    prop_assert_eq!(before[free].to_bits(), after[free].to_bits());
+                }
+                prop_assert!(after[1].is_nan() || after[1].abs() <= 10.0);
+                prop_assert!(after[4].is_nan() || after[4] == 0.0 || after[4] == 1.0);
+                let norm = squared_norm(&after[10..12]).sqrt();
+                prop_assert!(!norm.is_finite() || norm == 0.0 || (norm - 1.0).abs() < 1e-6);
+            }
+        }
+
+        /// The data's own rows are left as they are, and continuous columns of any scale are found to be nothing.
+        #[test]
+        fn own_rows_stay_and_continuous_columns_are_free(seed in 0u64..1000, rows in 1000usize..3000) {
+            let own = table(seed, rows);
+            let s = Support::fit(&[&own], DIM);
+            let mut after = own.clone();
+            s.apply(&mut after);
+            prop_assert_eq!(bits(&own), bits(&after));
+            let mut rng = Streams::new(seed).stream("normal");
+            let scale = 10f32.powi(rng.random_range(-6..6));
+            let free: Vec<f32> = (0..3 * rows).map(|_| {
+                let sum: f32 = (0..4).map(|_| rng.random_range(-1.0f32..1.0)).sum();
+                5.0 * scale + scale * sum
+            }).collect();
+            prop_assert!(Support::fit(&[&free], 3).is_empty());
+        }
+    }
+}

@@ -1,0 +1,538 @@
+//! Which trajectories of a data set of mixed quality to learn from.
+//!
+//! Cloning a set of two qualities clones neither; a set of one quality needs all its rows. [`choose_trajectories`] decides
+//! from the rewards alone.
+//!
+//! # The measures
+//!
+//! | measure | of | is |
+//! |---|---|---|
+//! | return | whole trajectories: they end by a terminal, or are at most two rows short of the longest | the sum of the rewards |
+//! | pace | trajectories at least a quarter as long as the longest | the median, over windows of a twentieth of the longest trajectory, of the mean reward per step |
+//!
+//! The pace hardly sees the start, a fall or an accident, nor where the log was cut; the return sees that a robot falls.
+//! A group's spread is the range of its values, without the outer tenth at either end where it has ten or more.
+//!
+//! # The rule
+//!
+//! The trajectories are split in two groups of least variance (weighed by rows), once by pace and once by return. With `g` = the gap
+//! between the groups, divided by the spread plus a hundredth of the better group's mean, and c the setting
+//! ([`CLEAR_GAP`]), a split is clear if the better group's mean return is higher by 15 % and one of these holds:
+//!
+//! - by pace: g_pace ≥ c, and the returns do not overlap or the mean paces differ by 15 %;
+//! - by return and pace: g_return ≥ c/2 and g_pace ≥ c/2;
+//! - by return alone (robots that are paid for not falling): g_return ≥ 3c/2, and two or more trajectories in the worse
+//!   group. A single short one is an accident, not a behaviour.
+//!
+//! The spread is the larger one of both groups for returns, the better group's for paces (a bad behaviour may be
+//! irregular), the other group's where a group has one trajectory only. Trajectories that a measure says nothing about
+//! join a group afterwards: whole ones by their return, cut ones by what the groups had earned at the same age.
+//! Everything is kept unless the split is clear and the better group has [`ENOUGH_ROWS`] rows.
+
+use serde::Serialize;
+
+use crate::{Episode, Transitions};
+
+/// The gap between two groups, in spreads within a group, from which they count as two behaviours.
+pub const CLEAR_GAP: f64 = 2.0;
+
+/// The fewest rows that are worth learning from alone.
+pub const ENOUGH_ROWS: usize = 500;
+
+/// Mean returns (and, where returns overlap, mean paces) of two behaviours differ by this share of the larger one.
+const LEAST_DIFFERENCE: f64 = 0.15;
+
+/// What a split was made by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Measure {
+    /// The sum of a whole trajectory's rewards.
+    Return,
+    /// The median over windows of the mean reward per step.
+    Pace,
+}
+
+/// The result of [`choose_trajectories`].
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Choice {
+    /// The rows to learn from, ascending; for [`Transitions::select`].
+    pub rows: Vec<usize>,
+    /// The trajectories that they make up, in row order.
+    pub episodes: Vec<Episode>,
+    /// Half way between the groups, in units of the measure; `None` if everything was kept.
+    pub threshold: Option<(Measure, f64)>,
+    /// One sentence for people.
+    pub reason: String,
+}
+
+impl Choice {
+    /// Whether some trajectories are left out.
+    pub fn is_selective(&self) -> bool {
+        self.threshold.is_some()
+    }
+}
+
+/// Chooses with [`CLEAR_GAP`].
+pub fn choose_trajectories(data: &Transitions) -> Choice {
+    choose_trajectories_with(data, CLEAR_GAP)
+}
+
+/// Chooses; `clear_gap` is the setting c: larger keeps everything more often, infinity always.
+pub fn choose_trajectories_with(data: &Transitions, clear_gap: f64) -> Choice {
+    let trajectories = measure(data);
+    let mut too_few = None;
+    for measure in [Measure::Pace, Measure::Return] {
+        let Some(better) = split(data, &trajectories, measure) else { continue };
+        let Some(threshold) = clear(&trajectories, &better, measure, clear_gap) else { continue };
+        let rows: Vec<usize> = trajectories
+            .iter()
+            .zip(&better)
+            .filter(|(_, b)| **b)
+            .flat_map(|(t, _)| t.episode.start..t.episode.end)
+            .collect();
+        if rows.len() < ENOUGH_ROWS {
+            too_few.get_or_insert(rows.len());
+            continue;
+        }
+        let reason = tell(&trajectories, &better, measure, rows.len(), data.len());
+        let episodes = trajectories.iter().zip(&better).filter(|(_, b)| **b).map(|(t, _)| t.episode).collect();
+        return Choice { rows, episodes, threshold: Some((measure, threshold)), reason };
+    }
+    Choice {
+        rows: (0..data.len()).collect(),
+        episodes: trajectories.iter().map(|t| t.episode).collect(),
+        threshold: None,
+        reason: tell_all(&trajectories, too_few),
+    }
+}
+
+/// A trajectory and what is known about it.
+struct Trajectory {
+    episode: Episode,
+    /// Its return, if it is whole.
+    whole: Option<f64>,
+    /// Its pace, if it is long enough.
+    pace: Option<f64>,
+}
+
+impl Trajectory {
+    fn len(&self) -> usize {
+        self.episode.end - self.episode.start
+    }
+
+    fn value(&self, measure: Measure) -> Option<f64> {
+        match measure {
+            Measure::Return => self.whole,
+            Measure::Pace => self.pace,
+        }
+    }
+}
+
+fn measure(data: &Transitions) -> Vec<Trajectory> {
+    let episodes = data.episodes();
+    let longest = episodes.iter().map(|e| e.end - e.start).max().unwrap_or(0);
+    let window = (longest / 20).max(1);
+    let of = |episode: Episode| {
+        let rewards = &data.rewards[episode.start..episode.end];
+        let whole = data.terminals[episode.end - 1] || rewards.len() + 2 >= longest;
+        let finite = episode.episode_return.is_finite();
+        Trajectory {
+            episode,
+            whole: (whole && finite).then_some(episode.episode_return),
+            pace: (rewards.len() * 4 >= longest && finite).then(|| pace(rewards, window)),
+        }
+    };
+    episodes.into_iter().map(of).collect()
+}
+
+/// The median of the means of full windows. A trajectory is never shorter than a window: a quarter against a twentieth.
+fn pace(rewards: &[f32], window: usize) -> f64 {
+    let mean = |w: &[f32]| w.iter().map(|&r| r as f64).sum::<f64>() / w.len() as f64;
+    let mut means: Vec<f64> = rewards.chunks_exact(window).map(mean).collect();
+    means.sort_by(f64::total_cmp);
+    let n = means.len();
+    if n == 0 { mean(rewards) } else { (means[(n - 1) / 2] + means[n / 2]) / 2.0 }
+}
+
+/// The split of least variance by `measure`: per trajectory, whether it is in the better group. `None` if all values are
+/// equal or fewer than two trajectories have one.
+fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure) -> Option<Vec<bool>> {
+    let mut known: Vec<(f64, f64)> =
+        trajectories.iter().filter_map(|t| Some((t.value(measure)?, t.len() as f64))).collect();
+    known.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let total: f64 = known.iter().map(|k| k.1).sum();
+    let mean = known.iter().map(|k| k.0 * k.1).sum::<f64>() / total;
+    // The largest variance between the groups is the least within them.
+    let (mut weight, mut sum) = (0.0, 0.0);
+    let mut best: Option<(f64, f64)> = None;
+    for pair in known.windows(2) {
+        weight += pair[0].1;
+        sum += pair[0].1 * (pair[0].0 - mean);
+        let between = sum * sum * (1.0 / weight + 1.0 / (total - weight));
+        if pair[0].0 < pair[1].0 && best.is_none_or(|b| between > b.0) {
+            best = Some((between, (pair[0].0 + pair[1].0) / 2.0));
+        }
+    }
+    let (_, threshold) = best?;
+    let mut better: Vec<Option<bool>> = trajectories.iter().map(|t| Some(t.value(measure)? > threshold)).collect();
+    let known = better.clone();
+    for (k, t) in trajectories.iter().enumerate() {
+        if better[k].is_none() {
+            let whole = t.whole.and_then(|r| {
+                let mean = |group| mean_of(trajectories, &known, group, |t| t.whole);
+                Some((r - mean(true)?).abs() < (r - mean(false)?).abs())
+            });
+            better[k] = whole.or_else(|| by_age(data, trajectories, &known, t));
+        }
+    }
+    // What nothing is known about is kept: no fall is in it.
+    Some(better.into_iter().map(|b| b.unwrap_or(true)).collect())
+}
+
+/// The group whose members had earned about as much at the age at which `cut` was cut.
+fn by_age(data: &Transitions, trajectories: &[Trajectory], known: &[Option<bool>], cut: &Trajectory) -> Option<bool> {
+    let earned = |t: &Trajectory| {
+        let start = t.episode.start;
+        (t.len() >= cut.len()).then(|| data.rewards[start..start + cut.len()].iter().map(|&r| r as f64).sum::<f64>())
+    };
+    let own = cut.episode.episode_return;
+    let distance = |group| mean_of(trajectories, known, group, earned).map(|m: f64| (own - m).abs());
+    match (distance(true), distance(false)) {
+        (Some(better), Some(worse)) => Some(better <= worse),
+        // Older than any of one group ever got.
+        (Some(_), None) => Some(true),
+        (None, Some(_)) => Some(false),
+        (None, None) => None,
+    }
+}
+
+fn mean_of(
+    trajectories: &[Trajectory],
+    known: &[Option<bool>],
+    group: bool,
+    value: impl Fn(&Trajectory) -> Option<f64>,
+) -> Option<f64> {
+    let of_group = trajectories.iter().zip(known).filter(|(_, k)| **k == Some(group));
+    mean(&of_group.filter_map(|(t, _)| value(t)).collect::<Vec<_>>())
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// The values of one group in one measure.
+struct Group {
+    count: usize,
+    mean: f64,
+    low: f64,
+    high: f64,
+}
+
+impl Group {
+    fn of(trajectories: &[Trajectory], better: &[bool], group: bool, measure: Measure) -> Option<Group> {
+        let of_group = trajectories.iter().zip(better).filter(|(_, b)| **b == group);
+        let mut values: Vec<f64> = of_group.filter_map(|(t, _)| t.value(measure)).collect();
+        values.sort_by(f64::total_cmp);
+        let (count, outer) = (values.len(), values.len() / 10);
+        Some(Group { count, mean: mean(&values)?, low: values[outer], high: values[count - 1 - outer] })
+    }
+
+    fn spread(&self) -> f64 {
+        self.high - self.low
+    }
+}
+
+/// The gap between two groups in spreads, negative if they overlap.
+fn gap(worse: &Group, better: &Group, measure: Measure) -> f64 {
+    let spread = match measure {
+        Measure::Pace if better.count > 1 => better.spread(),
+        _ => worse.spread().max(better.spread()),
+    };
+    let unit = spread + 0.01 * better.mean.abs();
+    if unit > 0.0 { (better.low - worse.high) / unit } else { 0.0 }
+}
+
+/// Whether `better`'s mean lies over `worse`'s by [`LEAST_DIFFERENCE`].
+fn differ(worse: &Group, better: &Group) -> bool {
+    better.mean - worse.mean >= LEAST_DIFFERENCE * better.mean.abs().max(worse.mean.abs())
+}
+
+/// The threshold, if the split by `measure` is clear.
+fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_gap: f64) -> Option<f64> {
+    let groups = |m| {
+        let of = |group| Group::of(trajectories, better, group, m);
+        Some((of(false)?, of(true)?))
+    };
+    let (returns, paces) = (groups(Measure::Return), groups(Measure::Pace));
+    if returns.as_ref().is_some_and(|(w, b)| !differ(w, b)) {
+        return None;
+    }
+    let size = |groups: &Option<(Group, Group)>, m| groups.as_ref().map_or(f64::NEG_INFINITY, |(w, b)| gap(w, b, m));
+    let (by_return, by_pace) = (size(&returns, Measure::Return), size(&paces, Measure::Pace));
+    let paces_differ = paces.as_ref().is_some_and(|(w, b)| differ(w, b));
+    let pace = by_pace >= clear_gap && (by_return > 0.0 || paces_differ);
+    let both = by_return >= clear_gap / 2.0 && by_pace >= clear_gap / 2.0;
+    let several = returns.as_ref().is_some_and(|(w, _)| w.count > 1);
+    let alone = several && by_return >= 1.5 * clear_gap;
+    let (worse, better) = match measure {
+        Measure::Return => returns?,
+        Measure::Pace => paces?,
+    };
+    (pace || both || alone).then_some((worse.high + better.low) / 2.0)
+}
+
+/// A number as a word, as far as such words are short.
+fn word(n: usize) -> String {
+    const WORDS: [&str; 13] =
+        ["none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"];
+    WORDS.get(n).map_or_else(|| n.to_string(), |w| (*w).to_owned())
+}
+
+fn capitalised(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
+
+/// `1290 to 1310`, or one number where both read the same.
+fn range(low: f64, high: f64) -> String {
+    let digits = if low.abs().max(high.abs()) < 100.0 { 2 } else { 0 };
+    let (low, high) = (format!("{low:.digits$}"), format!("{high:.digits$}"));
+    if low == high { low } else { format!("{low} to {high}") }
+}
+
+/// The smallest and the largest value of a group, or of everything (`None`).
+fn extremes(trajectories: &[Trajectory], better: Option<(&[bool], bool)>, measure: Measure) -> Option<String> {
+    let in_group = |k: usize| better.is_none_or(|(b, group)| b[k] == group);
+    let values = trajectories.iter().enumerate().filter(|(k, _)| in_group(*k)).filter_map(|(_, t)| t.value(measure));
+    let ends =
+        values.fold(None, |ends: Option<(f64, f64)>, v| Some(ends.map_or((v, v), |(lo, hi)| (lo.min(v), hi.max(v)))));
+    ends.map(|(low, high)| range(low, high))
+}
+
+fn tell(trajectories: &[Trajectory], better: &[bool], measure: Measure, kept: usize, rows: usize) -> String {
+    let good = better.iter().filter(|b| **b).count();
+    let bad = better.len() - good;
+    let verb = |verb: &str| if bad == 1 { format!("{verb}s") } else { verb.to_owned() };
+    let pair =
+        |m| Some((extremes(trajectories, Some((better, false)), m)?, extremes(trajectories, Some((better, true)), m)?));
+    let returns = pair(Measure::Return);
+    let paces = pair(Measure::Pace).filter(|_| measure == Measure::Pace || returns.is_none());
+    let numbers = match (returns, paces) {
+        (Some((w, b)), None) => format!("{} {w}, the other {} {b}", verb("return"), word(good)),
+        (Some((w, b)), Some((pw, pb))) => {
+            format!("{} {w} ({pw} per step), the other {} {b} ({pb} per step)", verb("return"), word(good))
+        }
+        (None, Some((w, b))) => format!("{} {w} per step, the other {} {b}", verb("earn"), word(good)),
+        (None, None) => format!("{} less than the other {}", verb("earn"), word(good)),
+    };
+    format!(
+        "{} of {} trajectories {numbers}: learned from the better {} ({kept} of {rows} rows).",
+        capitalised(&word(bad)),
+        word(better.len()),
+        word(good)
+    )
+}
+
+fn tell_all(trajectories: &[Trajectory], too_few: Option<usize>) -> String {
+    let n = trajectories.len();
+    if n < 2 {
+        return format!(
+            "There {} {} to choose from: all rows are kept.",
+            if n == 1 { "is" } else { "are" },
+            match n {
+                1 => "one trajectory",
+                _ => "no trajectories",
+            }
+        );
+    }
+    if let Some(rows) = too_few {
+        return format!(
+            "All {} trajectories are kept: the better ones have only {rows} rows, fewer than {ENOUGH_ROWS}.",
+            word(n)
+        );
+    }
+    let returns = extremes(trajectories, None, Measure::Return);
+    let numbers = returns.map_or_else(String::new, |r| format!(" (returns {r})"));
+    format!("All {} trajectories are kept{numbers}: they do not fall into two clearly different groups.", word(n))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::RngExt;
+    use tce_base::Streams;
+
+    use super::*;
+
+    /// How a trajectory ends.
+    #[derive(Clone, Copy, Debug, PartialEq)]
+    enum End {
+        Fall,
+        Limit,
+    }
+
+    /// Trajectories of (rows, reward per step, end); rewards rise over the first 50 rows, and differ a little by row.
+    fn data(trajectories: &[(usize, f32, End)], seed: u64) -> Transitions {
+        let mut rng = Streams::new(seed).stream("rewards");
+        let mut t = Transitions::new(1, 1);
+        for &(rows, reward, end) in trajectories {
+            for i in 0..rows {
+                let r = reward * ((i + 1) as f32 / 50.0).min(1.0) * rng.random_range(0.98f32..1.02);
+                let last = i + 1 == rows;
+                t.push(&[0.0], &[0.0], r, &[0.0], last && end == End::Fall, last && end == End::Limit);
+            }
+        }
+        t
+    }
+
+    fn kept(choice: &Choice, t: &Transitions) -> Vec<usize> {
+        let all = t.episodes();
+        choice.episodes.iter().map(|e| all.iter().position(|a| a == e).unwrap()).collect()
+    }
+
+    use End::{Fall, Limit};
+
+    #[test]
+    fn the_better_of_two_qualities_is_chosen_and_told() {
+        let t = data(
+            &[(1000, 1.3, Limit), (1000, 3.1, Limit), (1000, 1.31, Limit), (1000, 3.15, Limit), (1000, 3.2, Limit)],
+            1,
+        );
+        let c = choose_trajectories(&t);
+        assert_eq!(kept(&c, &t), [1, 3, 4]);
+        assert_eq!((c.rows.len(), c.rows[0], c.rows[1000]), (3000, 1000, 3000));
+        assert!(c.is_selective() && matches!(c.threshold, Some((Measure::Pace, x)) if x > 1.5 && x < 3.0));
+        assert!(c.reason.starts_with("Two of five trajectories return 12"), "{}", c.reason);
+        assert!(c.reason.ends_with(": learned from the better three (3000 of 5000 rows)."), "{}", c.reason);
+        assert!(!choose_trajectories_with(&t, f64::INFINITY).is_selective());
+    }
+
+    /// Paid for not falling, at the same pace: only the return tells, and one early fall is an accident.
+    #[test]
+    fn falls_tell_where_the_pace_does_not() {
+        let t =
+            data(&[(410, 1.0, Fall), (400, 1.0, Fall), (1000, 1.0, Limit), (1000, 1.0, Limit), (300, 1.0, Limit)], 2);
+        let c = choose_trajectories(&t);
+        // The last one was cut before anything could be told: kept.
+        assert_eq!(kept(&c, &t)[..2], [2, 3]);
+        assert!(matches!(c.threshold, Some((Measure::Return, _))), "{}", c.reason);
+        let t = data(&[(400, 1.0, Fall), (1000, 1.0, Limit), (1000, 1.01, Limit), (1000, 0.99, Limit)], 3);
+        assert!(!choose_trajectories(&t).is_selective());
+    }
+
+    #[test]
+    fn a_cut_trajectory_is_judged_by_its_age() {
+        for (reward, keep) in [(1.0, false), (3.0, true)] {
+            for rows in [30, 100, 300, 800] {
+                let t = data(
+                    &[
+                        (1000, 1.0, Limit),
+                        (1000, 1.05, Limit),
+                        (1000, 3.0, Limit),
+                        (1000, 3.1, Limit),
+                        (rows, reward, Limit),
+                    ],
+                    4,
+                );
+                let c = choose_trajectories(&t);
+                assert_eq!(
+                    kept(&c, &t),
+                    if keep { vec![2, 3, 4] } else { vec![2, 3] },
+                    "{rows} {reward}: {}",
+                    c.reason
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn one_quality_is_kept_whole() {
+        for trajectories in [
+            vec![],
+            vec![(500, 1.0, Limit)],
+            vec![(1000, 1.0, Limit); 5],
+            // Falls at any time.
+            vec![(300, 3.0, Fall), (460, 3.3, Fall), (700, 3.2, Fall), (1000, 2.9, Limit), (200, 3.0, Limit)],
+            // Costs, hardly different.
+            vec![(1000, -1.0, Limit), (1000, -1.05, Limit), (1000, -1.1, Limit)],
+            // A slope of qualities, as in a replay buffer.
+            (1..40).map(|i| (1000, i as f32, Limit)).collect(),
+        ] {
+            let t = data(&trajectories, 5);
+            let c = choose_trajectories(&t);
+            assert!(!c.is_selective(), "{}", c.reason);
+            assert_eq!((c.rows.len(), c.episodes.len()), (t.len(), trajectories.len()));
+            assert!(c.reason.contains("kept"), "{}", c.reason);
+        }
+        let mut broken = data(&[(1000, 1.0, Limit), (1000, 3.0, Limit)], 6);
+        broken.rewards[10] = f32::NAN;
+        assert!(!choose_trajectories(&broken).is_selective());
+    }
+
+    #[test]
+    fn costs_are_rewards_too() {
+        let t = data(&[(1000, -3.0, Limit), (1000, -1.0, Limit), (1000, -3.1, Limit), (1000, -1.02, Limit)], 7);
+        assert_eq!(kept(&choose_trajectories(&t), &t), [1, 3]);
+    }
+
+    #[test]
+    fn too_few_good_rows_are_not_learned_from_alone() {
+        let t =
+            data(&[(200, 1.0, Limit), (200, 1.0, Limit), (200, 1.01, Limit), (200, 3.0, Limit), (200, 3.0, Limit)], 8);
+        let c = choose_trajectories(&t);
+        assert_eq!(c.reason, "All five trajectories are kept: the better ones have only 400 rows, fewer than 500.");
+        assert_eq!(c.rows.len(), 1000);
+    }
+
+    /// A thousand episodes with some outliers in both groups: the outer tenth does not hide the gap.
+    #[test]
+    fn outliers_do_not_hide_two_qualities_of_many() {
+        let mut trajectories = Vec::new();
+        for i in 0..200 {
+            trajectories.push((100, if i % 25 == 0 { 2.0 } else { 1.0 + 0.001 * i as f32 }, Limit));
+            trajectories.push((100, if i % 25 == 0 { 2.2 } else { 3.0 + 0.001 * i as f32 }, Limit));
+        }
+        let t = data(&trajectories, 9);
+        let c = choose_trajectories(&t);
+        assert!(c.is_selective() && (c.episodes.len() as i64 - 200).abs() <= 10, "{}", c.reason);
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        /// Two clear qualities, in any order and any unit of reward: exactly the better ones, whole and in order.
+        #[test]
+        fn two_clear_qualities_in_any_order(
+            qualities in prop::collection::vec(any::<bool>(), 2..8), unit in prop_oneof![Just(1f32), Just(1e-3), Just(1e4)], seed in 0u64..100,
+        ) {
+            prop_assume!(qualities.contains(&true) && qualities.contains(&false));
+            let rows = |&q: &bool| (if q { 1000 } else { 700 }, unit * if q { 3.0 } else { 2.0 }, if q { Limit } else { Fall });
+            let t = data(&qualities.iter().map(rows).collect::<Vec<_>>(), seed);
+            let c = choose_trajectories(&t);
+            let good: Vec<usize> = (0..qualities.len()).filter(|&k| qualities[k]).collect();
+            prop_assert_eq!(kept(&c, &t), good, "{}", c.reason);
+            let rows: Vec<usize> = c.episodes.iter().flat_map(|e| e.start..e.end).collect();
+            prop_assert_eq!(rows, c.rows);
+        }
+
+        /// Whatever the rewards: the best whole trajectory is kept, rows are whole trajectories, the reason is a sentence.
+        #[test]
+        fn the_best_is_always_kept(
+            trajectories in prop::collection::vec((1usize..400, -3f32..3.0, any::<bool>()), 1..10), seed in 0u64..100,
+        ) {
+            let t = data(&trajectories.iter().map(|&(n, r, f)| (n, r, if f { Fall } else { Limit })).collect::<Vec<_>>(), seed);
+            let c = choose_trajectories(&t);
+            prop_assert!(!c.rows.is_empty() && c.reason.ends_with('.'));
+            prop_assert_eq!(c.rows.len(), c.episodes.iter().map(|e| e.end - e.start).sum::<usize>());
+            if c.is_selective() {
+                prop_assert!(c.rows.len() >= ENOUGH_ROWS && c.rows.len() < t.len());
+                let mean = |keep: bool| {
+                    let of: Vec<f64> = measure(&t).iter().filter(|x| c.episodes.contains(&x.episode) == keep).filter_map(|x| x.whole).collect();
+                    mean(&of)
+                };
+                if let (Some(good), Some(bad)) = (mean(true), mean(false)) {
+                    prop_assert!(good > bad);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! What is decided and found on the public target data, where they are at hand.
+//! `cargo nextest run --release -p tce-data --test mixed_data` prints the decisions.
+
+mod common;
+
+use tce_data::{Agent, Episode, LoadOptions, Shift, Support, Transitions, choose_trajectories, load};
+
+const SHIFTS: [Shift; 3] = [Shift::Morph, Shift::Kinematic, Shift::Gravity];
+
+fn pairs() -> Vec<(String, Transitions, Transitions)> {
+    let Some(shared) = common::shared() else {
+        eprintln!("SKIPPED: the public target data need TCE_SHARED");
+        return Vec::new();
+    };
+    let read = |agent: Agent, shift: Shift, quality: &str| {
+        let path = shared.join(format!("datasets/otdf/{agent}_{}_{quality}.hdf5", shift.file_name()));
+        load(&path, &LoadOptions { dims: Some(agent.dims()), ..LoadOptions::default() }).unwrap().transitions
+    };
+    let of = |agent, shift: Shift| {
+        (format!("{agent} {}", shift.file_name()), read(agent, shift, "medium"), read(agent, shift, "expert"))
+    };
+    Agent::ALL.into_iter().flat_map(|agent| SHIFTS.map(|shift| of(agent, shift))).collect()
+}
+
+/// The episodes of `t` that did not end with the file, at most `count`, from the `skip`th on (around the end).
+fn whole(t: &Transitions, count: usize, skip: usize) -> Vec<Episode> {
+    let mut all = t.episodes();
+    let limit = all.iter().map(|e| e.end - e.start).max().unwrap();
+    all.retain(|e| t.terminals[e.end - 1] || e.end - e.start + 2 >= limit);
+    let n = all.len();
+    (0..count.min(n)).map(|k| all[(k + skip) % n]).collect()
+}
+
+/// Episodes one after the other; the last one without its last `cut` share.
+fn join(parts: &[(&Transitions, Vec<Episode>)], cut: f64) -> Transitions {
+    let mut out = Transitions::new(parts[0].0.obs_dim, parts[0].0.act_dim);
+    for (t, episodes) in parts {
+        for e in episodes {
+            out.extend(&t.select(&(e.start..e.end).collect::<Vec<_>>()));
+        }
+    }
+    let start = out.episodes().last().unwrap().start;
+    let keep = start + ((out.len() - start) as f64 * (1.0 - cut)) as usize;
+    out.select(&(0..keep).collect::<Vec<_>>())
+}
+
+#[test]
+fn sets_of_one_quality_are_kept_whole() {
+    for (name, medium, expert) in pairs() {
+        for (quality, t) in [("medium", medium), ("expert", expert)] {
+            let c = choose_trajectories(&t);
+            println!("| {name} {quality} | {} |", c.reason);
+            assert!(!c.is_selective(), "{name} {quality}: {}", c.reason);
+        }
+    }
+}
+
+#[test]
+fn of_mixed_sets_the_expert_part_is_kept() {
+    let (mut right, mut all) = (0, 0);
+    for (name, medium, expert) in pairs() {
+        for (m, e) in [(2, 3), (4, 1), (1, 4)] {
+            for skip in 0..3 {
+                for (first, cut) in [
+                    ("medium", 0.0),
+                    ("medium", 0.4),
+                    ("medium", 0.9),
+                    ("expert", 0.0),
+                    ("expert", 0.4),
+                    ("expert", 0.9),
+                ] {
+                    let mut parts = [(&medium, whole(&medium, m, skip)), (&expert, whole(&expert, e, skip))];
+                    let (m, e) = (parts[0].1.len(), parts[1].1.len());
+                    if first == "expert" {
+                        parts.reverse();
+                    }
+                    let t = join(&parts, cut);
+                    let c = choose_trajectories(&t);
+                    let good = if first == "medium" { m..m + e } else { 0..e };
+                    let episodes = t.episodes();
+                    let exact = c.is_selective() && c.episodes == episodes[good];
+                    (right, all) = (right + exact as usize, all + 1);
+                    let verdict = match (exact, c.is_selective()) {
+                        (true, _) => "expert",
+                        (false, true) => "OTHER",
+                        (false, false) => "all",
+                    };
+                    println!("| {name} {m}+{e} from {skip}, {first} first, cut {cut} | {verdict} | {} |", c.reason);
+                }
+            }
+        }
+    }
+    println!("{right} of {all} mixed sets: exactly the expert part");
+    assert!(right as f64 >= 0.8 * all as f64, "{right} of {all}");
+}
+
+#[test]
+fn supports_of_the_public_sets() {
+    for (name, medium, expert) in pairs() {
+        for (quality, t) in [("medium", medium), ("expert", expert)] {
+            let s = Support::fit(&[&t.observations, &t.next_observations], t.obs_dim);
+            println!("{name} {quality}: {}", s.describe().join(" "));
+            let mut rows = t.observations.clone();
+            s.apply(&mut rows);
+            assert_eq!(rows, t.observations, "{name} {quality}");
+            let units: Vec<_> = s.units.iter().map(|u| (u.first, u.width)).collect();
+            let agent = name.split(' ').next().unwrap();
+            assert_eq!(units, if agent == "ant" { vec![(1, 4)] } else { vec![] }, "{name} {quality}");
+            assert_eq!(s.constants.len(), if agent == "ant" { 84 } else { 0 }, "{name} {quality}");
+            assert_eq!(!s.clips.is_empty(), agent == "hopper" || agent == "walker2d", "{name} {quality}");
+            for bound in s.clips.iter().flat_map(|c| [c.low, c.high]).flatten() {
+                assert_eq!(bound.value.abs(), 10.0, "{name} {quality}");
+            }
+        }
+    }
+}
