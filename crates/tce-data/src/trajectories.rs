@@ -8,25 +8,28 @@
 //! | measure | of | is |
 //! |---|---|---|
 //! | return | whole trajectories: they end by a terminal, or are at most two rows short of the longest | the sum of the rewards |
-//! | pace | trajectories at least a quarter as long as the longest | the median, over windows of a twentieth of the longest trajectory, of the mean reward per step |
+//! | pace | trajectories at least a quarter as long as the longest | the median, over windows of a tenth of the longest trajectory, of the mean reward per step |
 //!
 //! The pace hardly sees the start, a fall or an accident, nor where the log was cut; the return sees that a robot falls.
 //! A group's spread is the range of its values, without the outer tenth at either end where it has ten or more.
 //!
 //! # The rule
 //!
-//! The trajectories are split in two groups of least variance (weighed by rows), once by pace and once by return. With `g` = the gap
-//! between the groups, divided by the spread plus a hundredth of the better group's mean, and c the setting
-//! ([`CLEAR_GAP`]), a split is clear if the better group's mean return is higher by 15 % and one of these holds:
+//! The trajectories are split in two groups of least variance (weighed by rows): the whole ones by pace, then by return, then all by
+//! pace; the first clear split counts. With `g` = the gap between the groups, divided by the spread plus a hundredth of
+//! the better group's mean, and c the setting ([`CLEAR_GAP`]), a split is clear if the better group's mean return is higher
+//! by 15 % and one of these holds:
 //!
-//! - by pace: g_pace ≥ c, and the returns do not overlap or the mean paces differ by 15 %;
-//! - by return and pace: g_return ≥ c/2 and g_pace ≥ c/2;
-//! - by return alone (robots that are paid for not falling): g_return ≥ 3c/2, and two or more trajectories in the worse
-//!   group. A single short one is an accident, not a behaviour.
+//! - by pace: g_pace ≥ c, and the mean paces differ by 15 % (and, if the better group has one whole trajectory only,
+//!   g_return ≥ .6 c);
+//! - by both: g_return ≥ .6 c and g_pace ≥ .6 c, and the mean paces differ by 5 %;
+//! - by return (robots that are paid for not falling): g_return ≥ 1.5 c, and there are two or more whole trajectories in the
+//!   worse group. A single short one is an accident, not a behaviour.
 //!
 //! The spread is the larger one of both groups for returns, the better group's for paces (a bad behaviour may be
-//! irregular), the other group's where a group has one trajectory only. Trajectories that a measure says nothing about
-//! join a group afterwards: whole ones by their return, cut ones by what the groups had earned at the same age.
+//! irregular), the other group's where a group has one trajectory only. Cut trajectories count in a group's values only
+//! where it has no whole ones. Trajectories that did not make the split join a group: whole ones by their return; cut ones go
+//! to the worse group only if it had earned about as much at the same age, and the pace, if known, is nearer, too.
 //! Everything is kept unless the split is clear and the better group has [`ENOUGH_ROWS`] rows.
 
 use serde::Serialize;
@@ -39,8 +42,11 @@ pub const CLEAR_GAP: f64 = 2.0;
 /// The fewest rows that are worth learning from alone.
 pub const ENOUGH_ROWS: usize = 500;
 
-/// Mean returns (and, where returns overlap, mean paces) of two behaviours differ by this share of the larger one.
+/// Mean returns (and mean paces, where the pace decides alone) of two behaviours differ by this share of the larger one.
 const LEAST_DIFFERENCE: f64 = 0.15;
+/// Of the clear gap: what is asked of either measure where both tell, and of returns where they tell alone.
+const BOTH: f64 = 0.6;
+const ALONE: f64 = 1.5;
 
 /// What a split was made by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -81,8 +87,8 @@ pub fn choose_trajectories(data: &Transitions) -> Choice {
 pub fn choose_trajectories_with(data: &Transitions, clear_gap: f64) -> Choice {
     let trajectories = measure(data);
     let mut too_few = None;
-    for measure in [Measure::Pace, Measure::Return] {
-        let Some(better) = split(data, &trajectories, measure) else { continue };
+    for (measure, whole_only) in [(Measure::Pace, true), (Measure::Return, true), (Measure::Pace, false)] {
+        let Some(better) = split(data, &trajectories, measure, whole_only) else { continue };
         let Some(threshold) = clear(&trajectories, &better, measure, clear_gap) else { continue };
         let rows: Vec<usize> = trajectories
             .iter()
@@ -131,7 +137,7 @@ impl Trajectory {
 fn measure(data: &Transitions) -> Vec<Trajectory> {
     let episodes = data.episodes();
     let longest = episodes.iter().map(|e| e.end - e.start).max().unwrap_or(0);
-    let window = (longest / 20).max(1);
+    let window = (longest / 10).max(1);
     let of = |episode: Episode| {
         let rewards = &data.rewards[episode.start..episode.end];
         let whole = data.terminals[episode.end - 1] || rewards.len() + 2 >= longest;
@@ -145,20 +151,21 @@ fn measure(data: &Transitions) -> Vec<Trajectory> {
     episodes.into_iter().map(of).collect()
 }
 
-/// The median of the means of full windows. A trajectory is never shorter than a window: a quarter against a twentieth.
+/// The median of the means of windows, each four fifths over the one before. A trajectory with a pace is never shorter
+/// than a window: a quarter against a tenth.
 fn pace(rewards: &[f32], window: usize) -> f64 {
     let mean = |w: &[f32]| w.iter().map(|&r| r as f64).sum::<f64>() / w.len() as f64;
-    let mut means: Vec<f64> = rewards.chunks_exact(window).map(mean).collect();
+    let mut means: Vec<f64> = rewards.windows(window).step_by((window / 5).max(1)).map(mean).collect();
     means.sort_by(f64::total_cmp);
     let n = means.len();
     if n == 0 { mean(rewards) } else { (means[(n - 1) / 2] + means[n / 2]) / 2.0 }
 }
 
-/// The split of least variance by `measure`: per trajectory, whether it is in the better group. `None` if all values are
+/// The split of least variance by `measure` (of whole trajectories only, or of all that have it): per trajectory, whether it is in the better group. `None` if all values are
 /// equal or fewer than two trajectories have one.
-fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure) -> Option<Vec<bool>> {
-    let mut known: Vec<(f64, f64)> =
-        trajectories.iter().filter_map(|t| Some((t.value(measure)?, t.len() as f64))).collect();
+fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whole_only: bool) -> Option<Vec<bool>> {
+    let value = |t: &Trajectory| t.value(measure).filter(|_| !whole_only || t.whole.is_some());
+    let mut known: Vec<(f64, f64)> = trajectories.iter().filter_map(|t| Some((value(t)?, t.len() as f64))).collect();
     known.sort_by(|a, b| a.0.total_cmp(&b.0));
     let total: f64 = known.iter().map(|k| k.1).sum();
     let mean = known.iter().map(|k| k.0 * k.1).sum::<f64>() / total;
@@ -174,7 +181,7 @@ fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure) -> O
         }
     }
     let (_, threshold) = best?;
-    let mut better: Vec<Option<bool>> = trajectories.iter().map(|t| Some(t.value(measure)? > threshold)).collect();
+    let mut better: Vec<Option<bool>> = trajectories.iter().map(|t| Some(value(t)? > threshold)).collect();
     let known = better.clone();
     for (k, t) in trajectories.iter().enumerate() {
         if better[k].is_none() {
@@ -182,7 +189,12 @@ fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure) -> O
                 let mean = |group| mean_of(trajectories, &known, group, |t| t.whole);
                 Some((r - mean(true)?).abs() < (r - mean(false)?).abs())
             });
-            better[k] = whole.or_else(|| by_age(data, trajectories, &known, t));
+            // A cut one is left out only if nothing speaks for it.
+            let by_pace = t.pace.and_then(|pace| {
+                let mean = |group| mean_of(trajectories, &known, group, |t| t.pace);
+                Some((pace - mean(true)?).abs() < (pace - mean(false)?).abs())
+            });
+            better[k] = whole.or_else(|| Some(by_age(data, trajectories, &known, t)? || by_pace == Some(true)));
         }
     }
     // What nothing is known about is kept: no fall is in it.
@@ -230,8 +242,13 @@ struct Group {
 
 impl Group {
     fn of(trajectories: &[Trajectory], better: &[bool], group: bool, measure: Measure) -> Option<Group> {
-        let of_group = trajectories.iter().zip(better).filter(|(_, b)| **b == group);
-        let mut values: Vec<f64> = of_group.filter_map(|(t, _)| t.value(measure)).collect();
+        let of_group = || trajectories.iter().zip(better).filter(|(_, b)| **b == group).map(|(t, _)| t);
+        // A cut trajectory is a younger one: it counts only where there is no whole one.
+        let whole = of_group().filter(|t| t.whole.is_some()).filter_map(|t| t.value(measure));
+        let mut values: Vec<f64> = whole.collect();
+        if values.is_empty() {
+            values = of_group().filter_map(|t| t.value(measure)).collect();
+        }
         values.sort_by(f64::total_cmp);
         let (count, outer) = (values.len(), values.len() / 10);
         Some(Group { count, mean: mean(&values)?, low: values[outer], high: values[count - 1 - outer] })
@@ -252,9 +269,9 @@ fn gap(worse: &Group, better: &Group, measure: Measure) -> f64 {
     if unit > 0.0 { (better.low - worse.high) / unit } else { 0.0 }
 }
 
-/// Whether `better`'s mean lies over `worse`'s by [`LEAST_DIFFERENCE`].
-fn differ(worse: &Group, better: &Group) -> bool {
-    better.mean - worse.mean >= LEAST_DIFFERENCE * better.mean.abs().max(worse.mean.abs())
+/// Whether `better`'s mean lies over `worse`'s by this share of the larger one.
+fn differ(worse: &Group, better: &Group, share: f64) -> bool {
+    better.mean - worse.mean >= share * better.mean.abs().max(worse.mean.abs())
 }
 
 /// The threshold, if the split by `measure` is clear.
@@ -264,16 +281,19 @@ fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_g
         Some((of(false)?, of(true)?))
     };
     let (returns, paces) = (groups(Measure::Return), groups(Measure::Pace));
-    if returns.as_ref().is_some_and(|(w, b)| !differ(w, b)) {
+    if returns.as_ref().is_some_and(|(w, b)| !differ(w, b, LEAST_DIFFERENCE)) {
         return None;
     }
     let size = |groups: &Option<(Group, Group)>, m| groups.as_ref().map_or(f64::NEG_INFINITY, |(w, b)| gap(w, b, m));
     let (by_return, by_pace) = (size(&returns, Measure::Return), size(&paces, Measure::Pace));
-    let paces_differ = paces.as_ref().is_some_and(|(w, b)| differ(w, b));
-    let pace = by_pace >= clear_gap && (by_return > 0.0 || paces_differ);
-    let both = by_return >= clear_gap / 2.0 && by_pace >= clear_gap / 2.0;
+    let paces_differ = paces.as_ref().is_some_and(|(w, b)| differ(w, b, LEAST_DIFFERENCE));
+    let paces_differ_a_little = paces.as_ref().is_some_and(|(w, b)| differ(w, b, LEAST_DIFFERENCE / 3.0));
+    // A lone better one may be luck: its return has to stand out, too, where it is known.
+    let lone = returns.as_ref().is_some_and(|(_, b)| b.count == 1) && by_return < BOTH * clear_gap;
+    let pace = by_pace >= clear_gap && paces_differ && !lone;
+    let both = paces_differ_a_little && by_return.min(by_pace) >= BOTH * clear_gap;
     let several = returns.as_ref().is_some_and(|(w, _)| w.count > 1);
-    let alone = several && by_return >= 1.5 * clear_gap;
+    let alone = several && by_return >= ALONE * clear_gap;
     let (worse, better) = match measure {
         Measure::Return => returns?,
         Measure::Pace => paces?,
