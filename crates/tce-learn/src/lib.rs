@@ -15,6 +15,7 @@
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
+//! | one-step predictions in both domains, to filter rows and to try policies by | [`dynamics`] |
 //! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
 pub mod actor;
@@ -28,6 +29,7 @@ pub mod cvae;
 pub mod dara;
 pub mod deterministic;
 pub mod dmc;
+pub mod dynamics;
 mod error;
 pub mod igdf;
 pub mod import;
@@ -62,6 +64,7 @@ pub use bosa::{Bosa, BosaConfig};
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};
 pub use dara::{Dara, DaraConfig};
 pub use dmc::{Dmc, DmcConfig};
+pub use dynamics::{Domain, Dynamics, DynamicsConfig, Prediction, train_dynamics};
 pub use error::LearnError;
 pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};

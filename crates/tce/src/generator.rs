@@ -320,7 +320,7 @@ pub fn cycle_file(name: &str, step: u64) -> String {
 const HELD_OUT_RUN: usize = 25;
 
 /// The rows of `n` to train on, and the share that is held out, in runs at random places; both ascending. The same for all seeds.
-fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
+pub(crate) fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
     let runs = n.div_ceil(HELD_OUT_RUN);
     let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
     let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);

@@ -13,6 +13,7 @@ mod fuzz;
 mod generator;
 mod inputs;
 mod joint;
+mod judge;
 mod layers;
 mod learning;
 mod methods;

@@ -15,6 +15,7 @@ mod config;
 mod data;
 mod diagnose;
 mod evaluate;
+mod judge;
 mod learn;
 mod report;
 mod run;
@@ -53,6 +54,8 @@ enum Command {
     Learn(learn::Learn),
     /// Roll a policy out and report its returns.
     Evaluate(evaluate::Evaluate),
+    /// Compare policies by the two data sets alone, in learned dynamics; no simulator needed.
+    Judge(judge::JudgeArgs),
     /// Train agents by soft actor-critic in the simulator: actors for data of any quality.
     TrainSac(train_sac::TrainSac),
     /// The actors that come with the program.
@@ -99,6 +102,7 @@ impl Cli {
             Command::Augment(args) => args.run(output, &device()?),
             Command::Learn(args) => args.run(output, &device()?),
             Command::Evaluate(args) => args.run(output),
+            Command::Judge(args) => args.run(output, &device()?),
             Command::TrainSac(args) => args.run(output, &device()?),
             Command::Zoo(command) => command.run(output),
             Command::Collect(args) => args.run(output),

@@ -1,0 +1,98 @@
+//! `tce judge`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+use tce_learn::{DynamicsConfig, Policy};
+use tce_nn::Device;
+
+use crate::error::{Error, Result};
+use crate::inputs::Inputs;
+use crate::judge::{Judge, Judged};
+use crate::output::{Output, table};
+
+/// Arguments of `judge`.
+#[derive(Debug, Args)]
+pub struct JudgeArgs {
+    /// The policies to compare.
+    #[arg(required = true, value_name = "POLICY")]
+    policies: Vec<PathBuf>,
+    /// Many transitions of the unchanged robot.
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
+    /// Few transitions of the changed robot.
+    #[arg(long, value_name = "FILE")]
+    target: PathBuf,
+    /// Updates of the learned dynamics.
+    #[arg(long, default_value_t = DynamicsConfig::default().steps, value_name = "STEPS")]
+    dynamics_steps: u64,
+    /// Where the learned dynamics are kept, for a second call.
+    #[arg(long, default_value = "runs")]
+    cache: PathBuf,
+}
+
+#[derive(Serialize)]
+struct Report {
+    /// Median and 95th percentile of the errors of the learned dynamics on held-out target rows, in steps.
+    held_out: [f64; 2],
+    policies: Vec<Line>,
+}
+
+#[derive(Serialize)]
+struct Line {
+    policy: PathBuf,
+    #[serde(flatten)]
+    judged: Judged,
+}
+
+impl JudgeArgs {
+    /// Runs the command.
+    pub fn run(self, output: Output, device: &Device) -> Result<()> {
+        let inputs = Inputs::of_files(self.source.as_deref(), &self.target)?;
+        let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
+        let load = |path: &PathBuf| -> Result<Policy> {
+            let policy = Policy::load(path)?;
+            if policy.dims() != dims {
+                return Err(Error::Usage(format!(
+                    "{}: found a policy of {:?} observations and actions, expected {dims:?} as in {}; give a policy of this robot",
+                    path.display(),
+                    policy.dims(),
+                    self.target.display()
+                )));
+            }
+            Ok(policy)
+        };
+        let policies = self.policies.iter().map(load).collect::<Result<Vec<_>>>()?;
+        let config = DynamicsConfig { steps: self.dynamics_steps, ..DynamicsConfig::default() };
+        let judge = Judge::train(&inputs, &config, 0.05, &self.cache, device)?;
+        let lines = self.policies.iter().zip(&policies);
+        let lines = lines.map(|(path, policy)| Ok(Line { policy: path.clone(), judged: judge.judge(policy)? }));
+        let at = |q: f64| {
+            judge.held_out.get(((judge.held_out.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(f64::NAN)
+        };
+        let report = Report { held_out: [at(0.5), at(0.95)], policies: lines.collect::<Result<Vec<_>>>()? };
+        output.print(&report, render);
+        Ok(())
+    }
+}
+
+fn render(report: &Report) -> String {
+    let rows = report.policies.iter().map(|l| {
+        let j = &l.judged;
+        [
+            l.policy.display().to_string(),
+            format!("{:.0} ± {:.0}", j.imagined_return, j.standard_error),
+            format!("{:.0} %", 100.0 * j.survival),
+            format!("{:.2}", j.distance),
+            format!("{:.3}", j.action_error),
+        ]
+    });
+    let header = ["policy", "imagined return", "survival", "distance", "action error"];
+    format!(
+        "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n{}",
+        report.held_out[0],
+        report.held_out[1],
+        table(&header, rows)
+    )
+}
