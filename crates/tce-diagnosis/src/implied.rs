@@ -45,7 +45,10 @@ impl ImpliedErrors {
     /// # Panics
     /// If the tables differ in size.
     pub fn of(drawn: &[&[f32]], inferred: &[f32], actions: &[f32], act_dim: usize) -> Option<Self> {
-        assert!(drawn.iter().all(|d| d.len() == actions.len()) && inferred.len() == actions.len(), "tables of one size");
+        assert!(
+            drawn.iter().all(|d| d.len() == actions.len()) && inferred.len() == actions.len(),
+            "tables of one size"
+        );
         let total = actions.len() / act_dim;
         let whole = |i: &usize| {
             let row = i * act_dim..(i + 1) * act_dim;
@@ -273,6 +276,9 @@ mod tests {
         });
         all.behaviour_score = Some(90.0);
         let text = all.sentence();
-        assert!(text.contains("Rolled out for 10 episodes, it scores 61.0 ± 4.0; the target data score 90.0."), "{text}");
+        assert!(
+            text.contains("Rolled out for 10 episodes, it scores 61.0 ± 4.0; the target data score 90.0."),
+            "{text}"
+        );
     }
 }

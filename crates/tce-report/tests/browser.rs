@@ -182,7 +182,10 @@ fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
         source: Quality::Medium,
         target: Quality::Expert,
     })));
-    assert!(page.contains("it scores 61.0 ± 4.0; the target data score 90.0") && page.contains("Label error against distance"));
+    assert!(
+        page.contains("it scores 61.0 ± 4.0; the target data score 90.0")
+            && page.contains("Label error against distance")
+    );
     assert!(!page.contains("<b>tce") && !page.contains("NaN") && !page.contains("inf\""), "{page}");
     let Some(browser) = browser() else { return };
     let dir = tempfile::tempdir().unwrap();

@@ -215,11 +215,7 @@ impl Generator {
 
     /// Member `index` as a population of one.
     pub fn member(&self, index: usize) -> Self {
-        Self {
-            units: self.units.clone(),
-            state: self.state.member(index),
-            transition: self.transition.member(index),
-        }
+        Self { units: self.units.clone(), state: self.state.member(index), transition: self.transition.member(index) }
     }
 
     /// What q_tran is trained on: standardised outputs of the rows of `target`, `[rows, d]`.

@@ -10,8 +10,20 @@ use common::{TINY, data_pair, message, random_rows, tce, tce_json};
 use serde_json::Value;
 use tce_data::{Agent, Shift, save_d4rl};
 
-const FEW: &[&str] =
-    &["--rows", "200", "--y-max", "0,0.5", "--transition-steps", "40", "--value-steps", "20", "--abundant", "400", "--episodes", "2"];
+const FEW: &[&str] = &[
+    "--rows",
+    "200",
+    "--y-max",
+    "0,0.5",
+    "--transition-steps",
+    "40",
+    "--value-steps",
+    "20",
+    "--abundant",
+    "400",
+    "--episodes",
+    "2",
+];
 
 /// A tiny run on Hopper, as its table tells it.
 fn finished(directory: &Path, data: &[&str], more: &[&str]) -> Value {
@@ -174,11 +186,12 @@ fn networks_of_every_cycle_are_measured() {
         "--set",
         "generator.until_done={ first = 20, transition_limit = 60, gain = -100.0, held_out = 0.1 }",
     ];
-    finished(dir.path(), &data, &[&auto[..], &["--variant", "tce-og", "--no-floors"]].concat());
+    let run = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors"];
+    tce_json(dir.path(), &[&run[..], &data, TINY, &auto].concat());
     let stages = || fs::read_dir(dir.path().join("out/stages")).unwrap().count();
     let before = stages();
-    // The tiny settings come first: the last word counts.
-    let cycles = ["diagnose", "generator", "hopper-morph:medium->expert", "--cycles", "--rows", "200", "--episodes", "2"];
+    let cycles =
+        ["diagnose", "generator", "hopper-morph:medium->expert", "--cycles", "--rows", "200", "--episodes", "2"];
     let args = [&cycles[..], &data, TINY, &auto].concat();
     let found = tce_json(dir.path(), &[&args[..], &["--threads", "1"]].concat());
     assert_eq!(stages(), before, "nothing was trained");

@@ -175,7 +175,9 @@ mod tests {
 
     use tce_base::random::fill_uniform;
     use tce_data::{Agent, Shift, Standardizer};
-    use tce_diffusion::{Condition, Edm, NetworkConfig, Part, Process, Schedule, ScoreData, Target, TrainConfig, Trainer};
+    use tce_diffusion::{
+        Condition, Edm, NetworkConfig, Part, Process, Schedule, ScoreData, Target, TrainConfig, Trainer,
+    };
     use tce_learn::{LabelConfig, Member, train_labels};
     use tce_nn::{Checkpoints, cpu};
 
@@ -189,13 +191,15 @@ mod tests {
         let config = TrainConfig { learning_rate: 2e-3, schedule: Schedule::Cosine, batch: 64, ema: 0.99 };
         let process = Process::Edm(Edm::default());
         let states = units.states(&t.observations);
-        let outputs = units.output.apply(&Target::Delta.encode(&units.take(&t.observations), &units.take(&t.next_observations)));
+        let outputs =
+            units.output.apply(&Target::Delta.encode(&units.take(&t.observations), &units.take(&t.next_observations)));
         let part = Part { rows: &states, condition: Condition::Constant(vec![0.0]) };
         let state_data = ScoreData::new(vec![part], d, 1, false).unwrap();
         let transition_data = ScoreData::conditioned(&outputs, d, &states, d).unwrap();
         let dir = tempfile::tempdir().unwrap();
         let train = |name: &str, width: usize, data: ScoreData| {
-            let mut trainer = Trainer::new(name, NetworkConfig::new(d, width), process, config, &streams, &device).unwrap();
+            let mut trainer =
+                Trainer::new(name, NetworkConfig::new(d, width), process, config, &streams, &device).unwrap();
             let mut kept = Checkpoints::open(dir.path(), name, "test").unwrap();
             trainer.train(std::slice::from_ref(&data), steps, &mut kept, |_, _| ()).unwrap();
             trainer.model()
