@@ -274,20 +274,21 @@ fn distance(e: &ErrorOverDistance) -> Markup {
         let s = b.error;
         Some(Point { x: b.distance, y: log(s.median), band: Some((log(s.p10), log(s.p90))) })
     });
-    let note = match e.simulated {
-        true => "how wrong generated rows are, by how far their state is from the data",
-        false => "how far three models of the target's steps disagree, by how far a generated state is from the data",
+    let what = match e.simulated {
+        true => "how wrong generated rows are",
+        false => "how far three models of the target's steps disagree",
     };
     let unit = match e.by_episode {
-        true => "distance to the nearest target state (1: usual between episodes)",
-        false => "distance to the nearest target state, standard deviations",
+        true => "1: as far as target states of different episodes usually are",
+        false => "in standard deviations",
     };
+    let note = format!("{what}, by how far their state is from the data ({unit})");
     let series = if e.simulated { "error against the physics" } else { "disagreement of the models" };
     figure(
         "Label error against distance",
-        note,
-        (unit, Axis::around(e.bins.iter().map(|b| b.distance).chain([0.0]), 5)),
-        "error, in steps of the target (logarithmic)",
+        &note,
+        ("distance of ŝ to the target's states", Axis::around(e.bins.iter().map(|b| b.distance).chain([0.0]), 5)),
+        "error in steps (logarithmic)",
         true,
         vec![line(series, "m0", points)],
     )

@@ -1,7 +1,9 @@
 //! The network at the end of every cycle of q_tran (`generator.transition_steps = "auto"`), one row each: how long q_tran has to be
 //! trained until what it implies is sharp.
 //!
-//! Held-out losses and consistency flatten out long before the implied action does; the figures stand side by side here.
+//! Held-out losses and consistency flatten out, or rise, long before the implied action is as good as it gets; the figures stand side
+//! by side here. (Walker2d, 22.5k to 112.5k updates: the held-out loss rises by a third, the implied action's error at held-out rows falls
+//! by two fifths, the score rises from 16 to 84.)
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -220,9 +222,9 @@ impl AtCycle {
         "training loss",
         "consistency y=0",
         "action RMSE",
-        "held out",
-        "mean of draws",
-        "held out",
+        "RMSE held out",
+        "mean of 8",
+        "mean held out",
         "between draws",
         "Inv alone",
         "score",

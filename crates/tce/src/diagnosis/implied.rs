@@ -218,7 +218,7 @@ mod tests {
         (Generator { units, state, transition }, models)
     }
 
-    /// s' = s + .5 a in one component, a row apart in the other, and a = −s / 2 plus noise, or the noise alone.
+    /// s' = s + .5 a in one component and .9 s in the other; a = gain · s plus uniform noise.
     fn world(gain: f32, noise: f32) -> Transitions {
         let mut numbers = vec![0.0; 4 * 600];
         fill_uniform(&mut Streams::new(1).stream("world"), &mut numbers);
@@ -235,7 +235,7 @@ mod tests {
     fn actions_of_a_linear_world_are_found_again() {
         let split: (Vec<usize>, Vec<usize>) = (0..600).partition(|i| i % 10 != 0);
         let errors = |t: &Transitions| {
-            let (generator, models) = trained(t, 1500);
+            let (generator, models) = trained(t, 800);
             let actor = ImpliedActor::new(&generator, &models, 0, Sampler::SdeDpmSolver { steps: 10 }, t, &cpu());
             let found = implied_actions(&actor, t, (&split.0, &split.1), DRAWS, &Streams::new(2)).unwrap();
             (found.trained.unwrap(), found.held_out.unwrap())
