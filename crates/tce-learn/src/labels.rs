@@ -169,7 +169,7 @@ impl LabelModels {
     /// If there is no such member, or the lengths do not fit.
     pub fn actions(&self, member: usize, s: &[f32], s2: &[f32]) -> Result<Vec<f32>, LearnError> {
         let (obs_dim, members) = (self.buffer.obs_dim(), self.held_out.len());
-        if member >= members || s.len() != s2.len() || s.len() % obs_dim != 0 {
+        if member >= members || s.len() != s2.len() || !s.len().is_multiple_of(obs_dim) {
             let found = format!("member {member}, {} and {} numbers", s.len(), s2.len());
             let expected = format!("one of {members} members, and two tables with {obs_dim} columns");
             return Err(LearnError::invalid("pairs", found, expected, "give states and successors"));
