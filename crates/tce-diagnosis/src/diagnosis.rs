@@ -6,6 +6,7 @@ use tce_data::Task;
 use crate::bounds::{Bounds, Choice};
 use crate::coverage::Coverage;
 use crate::embedding::Embedding;
+use crate::implied::{ErrorOverDistance, Implied};
 use crate::memorisation::Memorisation;
 use crate::numbers::{Histogram, Spread};
 
@@ -44,6 +45,12 @@ pub struct Diagnosis {
     pub states: Vec<(f64, Embedding)>,
     /// Inverse dynamics and reward model.
     pub labels: Labels,
+    /// The policy that the generator implies; None in files from before it was measured.
+    #[serde(default)]
+    pub implied: Option<Implied>,
+    /// Errors of rows over the distance of ŝ to the target; None in files from before it was measured, and without rows.
+    #[serde(default)]
+    pub error_over_distance: Option<ErrorOverDistance>,
     /// Theorem 1; None without source rows.
     pub theorem: Option<Bounds>,
     /// λ from the data alone.

@@ -6,6 +6,7 @@
 //! | Which states do generated rows reach? (Fig. 3 a.2) | [`coverage`] |
 //! | What does it look like? (Fig. 1a, Fig. 3 a.1) | [`embedding`] |
 //! | Are generated rows copies of training rows? | [`memorisation`] |
+//! | Which policy do generated rows imply? How do their errors grow away from the data? | [`implied`] |
 //! | How far are two transition models apart? (Fig. 3 b.2) | [`gaussian`] |
 //! | What does Theorem 1 say, and which λ does it choose? | [`bounds`] |
 //! | Everything about one run | [`Diagnosis`] |
@@ -15,6 +16,7 @@ pub mod coverage;
 mod diagnosis;
 pub mod embedding;
 pub mod gaussian;
+pub mod implied;
 pub mod memorisation;
 mod numbers;
 
@@ -22,5 +24,6 @@ pub use bounds::{Bounds, Choice, Curve, MeanError, Part, Rated};
 pub use coverage::Coverage;
 pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};
 pub use embedding::{Embedding, Group};
+pub use implied::{ErrorOverDistance, Implied, ImpliedActions, ImpliedErrors, ImpliedRollout};
 pub use memorisation::{HeldOut, Memorisation, Verdict};
 pub use numbers::{Histogram, Spread};

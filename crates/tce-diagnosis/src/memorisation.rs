@@ -114,6 +114,11 @@ impl HeldOut {
         Ok(Some(held_out))
     }
 
+    /// Median distance of a training row to the nearest one of another episode.
+    pub fn median_distance(&self) -> Option<f64> {
+        Spread::of(self.distances.iter().flatten().copied()).map(|s| s.median)
+    }
+
     /// Distances of `rows` to the nearest training row outside of `episode`.
     fn without(&self, episode: &Range<usize>, rows: &[f32]) -> Result<Vec<f64>, DataError> {
         let others = [&self.rows[..episode.start * self.dim], &self.rows[episode.end * self.dim..]].concat();
@@ -234,6 +239,7 @@ mod tests {
         for (found, expected) in held_out.distances.concat().iter().zip([5.0, 4.9, 4.0, 3.8, 3.8]) {
             assert!((found - expected).abs() < 1e-6);
         }
+        assert!((held_out.median_distance().unwrap() - 4.0).abs() < 1e-6);
         let one = std::iter::once(0..5).collect();
         assert!(HeldOut::new(rows.clone(), 1, one).unwrap().is_none());
         assert!(HeldOut::new(rows, 1, vec![0..3, 3..5]).unwrap().is_none(), "two rows are too few to compare with");

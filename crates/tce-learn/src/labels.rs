@@ -162,6 +162,25 @@ impl LabelModels {
         self.held_out.iter().enumerate().map(error).collect()
     }
 
+    /// Actions that `member` infers from (s, s'), both `[N, obs_dim]` row-major in original units: `[N, act_dim]`, clipped to [-1, 1].
+    /// What is not finite stays so.
+    ///
+    /// # Errors
+    /// If there is no such member, or the lengths do not fit.
+    pub fn actions(&self, member: usize, s: &[f32], s2: &[f32]) -> Result<Vec<f32>, LearnError> {
+        let (obs_dim, members) = (self.buffer.obs_dim(), self.held_out.len());
+        if member >= members || s.len() != s2.len() || !s.len().is_multiple_of(obs_dim) {
+            let found = format!("member {member}, {} and {} numbers", s.len(), s2.len());
+            let expected = format!("one of {members} members, and two tables with {obs_dim} columns");
+            return Err(LearnError::invalid("pairs", found, expected, "give states and successors"));
+        }
+        let mut tables = vec![Vec::new(); members];
+        tables[member] = pairs(s, s2, obs_dim);
+        let mut actions = self.action.predict(&self.buffer, &tables, &self.device).swap_remove(member);
+        actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
+        Ok(actions)
+    }
+
     /// Labels for generated pairs: per member (s, s'), both `[N, obs_dim]` row-major in original units.
     ///
     /// # Errors

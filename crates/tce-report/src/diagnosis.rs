@@ -7,7 +7,8 @@ use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::coverage::NEIGHBOUR;
 use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Memorisation, Reliability, Spread,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Implied, Memorisation,
+    Reliability, Spread,
 };
 
 use crate::analysis::Analysis;
@@ -145,6 +146,11 @@ fn one(d: &Diagnosis) -> Markup {
     html! {
         h3 { "Coverage and reliability over y" sub { "max" } }
         div class="panels small" { (coverage(d)) (copies(d)) (reliability(d)) }
+        @if let Some(i) = &d.implied { h3 { "The policy that the generator implies" } (implied(i)) }
+        @if let Some(e) = &d.error_over_distance {
+            h3 { "Generated rows near the data and far from them" }
+            div class="panels small" { (distance(e)) }
+        }
         h3 { "Pictures" }
         div class="panels small" {
             @if let Some(e) = &d.transitions { (picture("Transitions (s, s')", &format!("y_max = {}", plain(d.y_max)), e)) }
@@ -235,6 +241,57 @@ fn reliability(d: &Diagnosis) -> Markup {
             ]))
         }
     }
+}
+
+/// Implied actions and their rollout, in a sentence and a table.
+fn implied(i: &Implied) -> Markup {
+    let groups = [("at rows that the generator saw", i.actions.trained), ("at rows held out", i.actions.held_out)];
+    let groups = || groups.iter().filter_map(|(name, e)| e.map(|e| (name, e)));
+    html! {
+        p { (i.sentence()) }
+        @if groups().next().is_some() {
+            div class="scroll" {
+                table {
+                    thead { tr {
+                        th class="first" { "Actions, RMS over rows and components" }
+                        th { "one draw − behaviour" } th { "mean of draws − behaviour" } th { "between draws" }
+                        th { "inferred from real s' − behaviour" } th { "spread of the behaviour" }
+                    } }
+                    tbody { @for (name, e) in groups() { tr {
+                        th scope="row" { (name) " (" (counted(e.rows, "row", "rows")) ", " (counted(e.draws, "draw", "draws")) ")" }
+                        @for v in [e.single, e.mean, e.between_draws, e.inverse, e.spread] { td { (number(v)) } }
+                    } } }
+                }
+            }
+        }
+    }
+}
+
+/// Label error against distance.
+fn distance(e: &ErrorOverDistance) -> Markup {
+    let log = |v: f64| v.max(1e-9).log10();
+    let points = e.bins.iter().map(|b| {
+        let s = b.error;
+        Some(Point { x: b.distance, y: log(s.median), band: Some((log(s.p10), log(s.p90))) })
+    });
+    let what = match e.simulated {
+        true => "how wrong generated rows are",
+        false => "how far three models of the target's steps disagree",
+    };
+    let unit = match e.by_episode {
+        true => "1: as far as target states of different episodes usually are",
+        false => "in standard deviations",
+    };
+    let note = format!("{what}, by how far their state is from the data ({unit})");
+    let series = if e.simulated { "error against the physics" } else { "disagreement of the models" };
+    figure(
+        "Label error against distance",
+        &note,
+        ("distance of ŝ to the target's states", Axis::around(e.bins.iter().map(|b| b.distance).chain([0.0]), 5)),
+        "error in steps (logarithmic)",
+        true,
+        vec![line(series, "m0", points)],
+    )
 }
 
 fn picture(title: &str, note: &str, e: &Embedding) -> Markup {
@@ -512,6 +569,20 @@ fn explanation() -> Markup {
                  the other episodes (after Meehan et al. 2020). P is the probability that the generated row is the nearer one: one half for \
                  fresh rows. Rows are called copies from half the way between that and what copies get, and beside the data below "
                 (BESIDE) ". Exact copies are counted as well. Where every episode is a place of its own, fresh rows get the P of copies."
+            }
+            p {
+                b { "Implied policy. " } "At a real target state s the generator draws a successor ŝ', and the inverse dynamics model infers \
+                 the action that leads there. Whoever learns from generated rows imitates these actions: rows may agree with the physics \
+                 and still belong to a behaviour that nobody had. The difference holds the noise of the behaviour's own actions, which \
+                 no generator can foresee; a draw of exactly the behaviour's noise is √2 times as far from it as the noise is wide. Networks \
+                 that were trained too briefly draw actions that are farther apart than the behaviour's, and the rollout scores less."
+            }
+            p {
+                b { "Label error against distance. " } "Rows that pass the filter under all y_max together, in bins of as many rows each; the \
+                 line is the median of a bin, the band reaches from the 10th to the 90th percentile. The unit of distance is the median distance of a \
+                 target state to the nearest one of another episode. The error is the difference between the generated successor and what \
+                 the simulator does at (ŝ, â), in units of the spread of the target's steps: 1 is as wrong as a whole step. Without a \
+                 simulator it is how far models that lack a third of the target rows each are apart."
             }
             p {
                 b { "Theorem 1. " } "Expectations over ρ" sub { "mix" } " are means over source rows for the first term and over generated rows for the \

@@ -7,8 +7,8 @@ use std::process::Command;
 
 use tce_data::{Agent, Quality, Shift, Task};
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Memorisation, Rated,
-    Reliability, Sampled, Spread,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied,
+    ImpliedActions, ImpliedErrors, ImpliedRollout, Labels, Memorisation, Rated, Reliability, Sampled, Spread,
 };
 
 fn browser() -> Option<PathBuf> {
@@ -104,6 +104,16 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
     let sources: Vec<f64> = (0..100).map(|i| 0.5 + 0.01 * f64::from(i)).collect();
     let curve = Curve::of(&Rated::certain(sources), &Rated::certain(generated));
     let histogram = |n: u64| Histogram { low: 0.0, high: 0.2, counts: (0..20).map(|k| n + k % 3).collect() };
+    let implied = ImpliedErrors {
+        rows: 2000,
+        lost: 0,
+        draws: 8,
+        single: 0.25,
+        mean: 0.2,
+        between_draws: 0.15,
+        inverse: 0.03,
+        spread: 0.5,
+    };
     Diagnosis {
         of: "tce-og-<b>".into(),
         task,
@@ -133,6 +143,22 @@ fn diagnosis(task: Option<Task>) -> Diagnosis {
             at_generated: Some((0.1, 0.2)),
             terminal: Some(0.01),
         },
+        implied: Some(Implied {
+            actions: ImpliedActions { trained: Some(implied), held_out: Some(implied) },
+            rollout: Some(ImpliedRollout {
+                episodes: 10,
+                score: Some((61.0, 4.0)),
+                returns: Some((1000.0, 50.0)),
+                length: Some(900.0),
+                failed: None,
+            }),
+            behaviour_score: Some(90.0),
+        }),
+        error_over_distance: ErrorOverDistance::of(
+            (1..=100).map(|i| (0.01 * f64::from(i), 0.02 * f64::from(i))).collect(),
+            Some(0.3),
+            true,
+        ),
         choice: curve.as_ref().map(Choice::of),
         choice_by_simulator: curve.as_ref().map(Choice::of),
         theorem: Some(Bounds {
@@ -156,6 +182,10 @@ fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
         source: Quality::Medium,
         target: Quality::Expert,
     })));
+    assert!(
+        page.contains("it scores 61.0 ± 4.0; the target data score 90.0")
+            && page.contains("Label error against distance")
+    );
     assert!(!page.contains("<b>tce") && !page.contains("NaN") && !page.contains("inf\""), "{page}");
     let Some(browser) = browser() else { return };
     let dir = tempfile::tempdir().unwrap();
@@ -164,8 +194,8 @@ fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
     let (document, console) = open(&browser, &path);
     assert_eq!(console, Vec::<String>::new());
     let figures: Vec<&str> = document.split("<figure>").skip(1).collect();
-    // Coverage, copies, five of reliability, two pictures, two histograms, two bounds.
-    assert_eq!(figures.len(), 13);
+    // Coverage, copies, five of reliability, errors over distance, two pictures, two histograms, two bounds.
+    assert_eq!(figures.len(), 14);
     for figure in figures {
         assert!(drawn(figure) >= 2, "{figure}");
     }

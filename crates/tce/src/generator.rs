@@ -137,9 +137,7 @@ impl Generator {
         let (s, s2) = (units.take(&target.observations), units.take(&target.next_observations));
         let all_states = units.state.apply(&s);
         // Rows that tell when to stop are seen by neither network.
-        let auto = [g.state_steps, g.transition_steps].contains(&Length::Auto);
-        let share = if auto { g.until_done.held_out } else { 0.0 };
-        let (kept, held_out) = hold_out_runs(target.len(), share);
+        let (kept, held_out) = held_out_rows(target.len(), g);
         let pick = |rows: &[f32], of: &[usize]| -> Vec<f32> {
             of.iter().flat_map(|&i| rows[i * d..(i + 1) * d].iter().copied()).collect()
         };
@@ -215,6 +213,17 @@ impl Generator {
         Ok((Self { units, state: state.model, transition: transition.model }, trained))
     }
 
+    /// Member `index` as a population of one.
+    pub fn member(&self, index: usize) -> Self {
+        Self { units: self.units.clone(), state: self.state.member(index), transition: self.transition.member(index) }
+    }
+
+    /// What q_tran is trained on: standardised outputs of the rows of `target`, `[rows, d]`.
+    pub(crate) fn outputs(&self, target: &Transitions) -> Vec<f32> {
+        let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
+        self.units.output.apply(&self.units.target.encode(&s, &s2))
+    }
+
     /// Samples `rows` states per member under ŷ ~ U(0, y_max): live dimensions in the data's units, `[P, rows, d]`.
     pub fn sample_states(
         &self,
@@ -250,10 +259,7 @@ impl Generator {
         let d = self.units.live.len();
         let rows = states.len() / (d * members.len());
         let condition = self.units.state.apply(states);
-        let outputs = || {
-            let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
-            self.units.output.apply(&self.units.target.encode(&s, &s2))
-        };
+        let outputs = || self.outputs(target);
         let start = start_rows(self.transition.process(), outputs, d, rows, members, "successor");
         let progress = progress("sample successors", rows * members.len(), sampler);
         let request =
@@ -325,6 +331,12 @@ pub(crate) fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
     let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
     let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
     (0..n).partition(|i| chosen.binary_search(&(i / HELD_OUT_RUN)).is_err())
+}
+
+/// Of `n` target rows, those that the networks of `config` are trained on, and those that are held out to tell when to stop.
+pub(crate) fn held_out_rows(n: usize, config: &GeneratorConfig) -> (Vec<usize>, Vec<usize>) {
+    let auto = [config.state_steps, config.transition_steps].contains(&Length::Auto);
+    hold_out_runs(n, if auto { config.until_done.held_out } else { 0.0 })
 }
 
 /// How long a network is trained.

@@ -1,5 +1,6 @@
 //! What training says while it runs: JSON lines for programs, TensorBoard events for eyes.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -84,6 +85,18 @@ impl Metrics {
         let values = line.values.iter().map(|(name, v)| (format!("{}/{name}", line.stage), value(v)));
         self.events[line.member].scalars(line.step, values)
     }
+}
+
+/// The values named `figure` of `member` in the stage `stage` of a `metrics.jsonl`, by step; nothing where there is no such file.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn recorded(path: &Path, stage: &str, member: usize, figure: &str) -> Result<BTreeMap<u64, f64>, FileError> {
+    let text = read_if_there(path)?.unwrap_or_default();
+    let text = String::from_utf8_lossy(&text);
+    let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
+    let own = lines.filter(|line| line.stage == stage && line.member == member);
+    Ok(own.filter_map(|line| Some((line.step, line.values.get(figure)?.as_f64()?))).collect())
 }
 
 /// One line of `metrics.jsonl`.

@@ -10,8 +10,20 @@ use common::{TINY, data_pair, message, random_rows, tce, tce_json};
 use serde_json::Value;
 use tce_data::{Agent, Shift, save_d4rl};
 
-const FEW: &[&str] =
-    &["--rows", "200", "--y-max", "0,0.5", "--transition-steps", "40", "--value-steps", "20", "--abundant", "400"];
+const FEW: &[&str] = &[
+    "--rows",
+    "200",
+    "--y-max",
+    "0,0.5",
+    "--transition-steps",
+    "40",
+    "--value-steps",
+    "20",
+    "--abundant",
+    "400",
+    "--episodes",
+    "2",
+];
 
 /// A tiny run on Hopper, as its table tells it.
 fn finished(directory: &Path, data: &[&str], more: &[&str]) -> Value {
@@ -61,6 +73,15 @@ fn a_run_is_measured_and_its_report_shows_it() {
     }
     assert!(found["choice"]["lambda"].is_number() && at(&found, 0.2)["memorisation"]["probability"].is_number());
     assert!(found["transitions"]["groups"].as_array().unwrap().len() == 4);
+    let implied = &found["implied"];
+    for figure in ["single", "mean", "between_draws", "inverse", "spread"] {
+        assert!(implied["actions"]["trained"][figure].as_f64().unwrap() > 0.0, "{figure}: {implied}");
+    }
+    assert!(implied["actions"]["held_out"].is_null(), "all rows were trained on");
+    assert!(implied["rollout"]["episodes"] == 2 && implied["rollout"]["score"][0].is_number(), "{implied}");
+    let bins = found["error_over_distance"]["bins"].as_array().unwrap();
+    assert!(bins.len() == 10 && bins.iter().all(|b| b["error"]["median"].as_f64().unwrap() > 0.0), "{bins:?}");
+    assert_eq!(found["error_over_distance"]["simulated"], true);
 
     // The same bytes with two threads, elsewhere; and at once where it is done.
     let bytes = file(dir.path(), &found, "diagnosis.json");
@@ -70,6 +91,14 @@ fn a_run_is_measured_and_its_report_shows_it() {
 
     let page = file(dir.path(), &found, "diagnosis.html");
     assert!(page.contains("Theorem 1 over λ") && !page.contains("NaN"));
+    assert!(page.contains("The action that the generator implies") && page.contains("Label error against distance"));
+    // A file from before these were measured.
+    let mut old: Value = serde_json::from_str(&bytes).unwrap();
+    for field in ["implied", "error_over_distance"] {
+        assert!(old.as_object_mut().unwrap().remove(field).is_some(), "{field}");
+    }
+    let old: tce_diagnosis::Diagnosis = serde_json::from_value(old).unwrap();
+    assert!(old.implied.is_none() && old.error_over_distance.is_none());
     tce_json(dir.path(), &["report", "out", "--resamples", "200"]);
     let report = fs::read_to_string(dir.path().join("out/report.html")).unwrap();
     assert!(report.contains("λ from the data alone") && report.contains("Dynamics consistency"));
@@ -108,6 +137,8 @@ fn two_files_of_ones_own_need_no_simulator() {
     assert!(
         found["theorem"]["value"].is_null() && found["theorem"]["value_alone"]["generated"]["rows"].as_u64() > Some(0)
     );
+    assert!(found["implied"]["actions"]["trained"]["single"].is_number() && found["implied"]["rollout"].is_null());
+    assert_eq!(found["error_over_distance"]["simulated"], false);
     let note = found["notes"][0].as_str().unwrap();
     assert!(note.contains("Without the simulator"), "{note}");
 
@@ -141,6 +172,38 @@ fn source_rows_of_the_targets_dynamics_have_no_discrepancy() {
     assert!(source_gap(&other) > 1e-2 * generated(&other), "{}", other["theorem"]["value"]);
     assert_eq!(same["choice_by_simulator"]["lambda"], 1.0);
     assert_eq!(same["choice_by_simulator"]["told"], true);
+}
+
+/// The stage of a run's networks is the one that is looked at, a row for every cycle of q_tran.
+#[test]
+fn networks_of_every_cycle_are_measured() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap(), "--out", "out"];
+    let auto = [
+        "--set",
+        "generator.transition_steps=\"auto\"",
+        "--set",
+        "generator.until_done={ first = 20, transition_limit = 60, gain = -100.0, held_out = 0.1 }",
+    ];
+    let run = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors"];
+    tce_json(dir.path(), &[&run[..], &data, TINY, &auto].concat());
+    let stages = || fs::read_dir(dir.path().join("out/stages")).unwrap().count();
+    let before = stages();
+    let cycles =
+        ["diagnose", "generator", "hopper-morph:medium->expert", "--cycles", "--rows", "200", "--episodes", "2"];
+    let args = [&cycles[..], &data, TINY, &auto].concat();
+    let found = tce_json(dir.path(), &[&args[..], &["--threads", "1"]].concat());
+    assert_eq!(stages(), before, "nothing was trained");
+    let networks = found["networks"].as_array().unwrap();
+    assert_eq!(networks.iter().map(|n| n["updates"].as_u64().unwrap()).collect::<Vec<_>>(), [20, 60]);
+    assert_eq!(networks.iter().filter(|n| n["chosen"] == true).count(), 1);
+    for n in networks {
+        assert!(n["held_out_loss"].is_number() && n["training_loss"].is_number(), "{n}");
+        assert!(n["consistency"]["median"].is_number() && n["rollout"]["score"][0].is_number(), "{n}");
+        assert!(n["actions"]["trained"]["single"].is_number() && n["actions"]["held_out"]["rows"] == 50, "{n}");
+    }
+    assert_eq!(tce_json(dir.path(), &[&args[..], &["--threads", "2"]].concat()), found);
 }
 
 /// One of two seeds is looked at, and not the other.

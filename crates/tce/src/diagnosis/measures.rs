@@ -8,17 +8,20 @@ use tce_base::random::choose;
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, Group, Histogram, Labels, Rated, Reliability,
-    Sampled, Spread, coverage, gaussian, memorisation,
+    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied,
+    Labels, Rated, Reliability, Sampled, Spread, coverage, gaussian, memorisation,
 };
 use tce_learn::{Densities, rmse};
 use tce_nn::Device;
 
+use super::implied::{DRAWS, ImpliedActor, implied_actions, rollout_implied};
 use super::models::{Models, finite};
 use super::rows::{Batch, Sampler};
 use super::{Options, Subject, generator};
+use crate::actors::Arena;
 use crate::config::SourceRows;
 use crate::error::Result;
+use crate::generator::held_out_rows;
 use crate::mixture::distances;
 use crate::units::Units;
 
@@ -185,6 +188,8 @@ impl Work<'_> {
             transitions: self.picture(own, sources.as_ref(), &streams, true),
             states,
             labels: self.labels(label_errors, own, &models)?,
+            implied: Some(self.implied(device)?),
+            error_over_distance: self.error_over_distance(&batches, &models, &step)?,
             choice: theorem.as_ref().and_then(|t| t.value_alone.as_ref()).map(Choice::of),
             choice_by_simulator: theorem.as_ref().and_then(|t| t.value.as_ref()).map(Choice::of),
             theorem,
@@ -324,6 +329,55 @@ impl Work<'_> {
             at_generated: errors(models.at_generated.as_ref())?,
             terminal,
         })
+    }
+
+    /// The policy that the generator implies.
+    fn implied(&self, device: &Device) -> Result<Implied> {
+        let Self { subject, options, sampler, .. } = self;
+        let Subject { inputs, config, seed, .. } = **subject;
+        let target = &inputs.target.rows;
+        let (generator, models) = (sampler.generator, sampler.finisher.models);
+        let actor = ImpliedActor::new(generator, models, sampler.member, config.generator.sampler, target, device);
+        let streams = Streams::new(seed).child("diagnosis/implied");
+        let (trained, held_out) = held_out_rows(target.len(), &config.generator);
+        let actions = implied_actions(&actor, target, (&trained, &held_out), DRAWS, &streams)?;
+        let scores = config.evaluation.scores;
+        let rollout = match self.simulator {
+            Some((agent, shift)) if options.episodes > 0 => {
+                let arena = Arena::new(agent, shift, scores);
+                Some(rollout_implied(&actor, arena, options.episodes, streams.child("rollout"))?)
+            }
+            _ => None,
+        };
+        Ok(Implied { actions, rollout, behaviour_score: inputs.behaviour(scores).1.score })
+    }
+
+    /// Errors of the rows that pass the filter, under all bounds together, over the distance of ŝ to the nearest target state.
+    fn error_over_distance(
+        &self,
+        batches: &[Batch],
+        models: &Models,
+        step: &[f32],
+    ) -> Result<Option<ErrorOverDistance>> {
+        let (units, target) = (self.units(), &self.subject.inputs.target.rows);
+        let (d, real) = (units.live.len(), units.states(&target.observations));
+        let mut pairs = Vec::new();
+        for batch in batches.iter().filter(|b| b.kept() > 0) {
+            let kept = batch.kept_rows();
+            let states = units.states(&kept.observations);
+            let nearest = nn_distances(&Rows::new(&states, d), &Rows::new(&real, d), &NeighbourOptions::default())?;
+            let errors = match &batch.simulated {
+                Some(s) => {
+                    let all = generator::step_errors(&s.next_observations, &batch.rows, step, &units.live);
+                    all.into_iter().zip(&batch.keep).filter(|(_, keep)| **keep).map(|(e, _)| e).collect()
+                }
+                None => models.successors_apart(&kept, step, &units.live),
+            };
+            pairs.extend(nearest.into_iter().map(f64::from).zip(errors));
+        }
+        let episodes = target.episodes().iter().map(|e| e.start..e.end).collect();
+        let unit = memorisation::HeldOut::new(real, d, episodes)?.and_then(|h| h.median_distance());
+        Ok(ErrorOverDistance::of(pairs, unit, self.simulator.is_some()))
     }
 
     /// Theorem 1 over λ.
@@ -505,7 +559,7 @@ fn others(count: usize, places: &[usize]) -> Vec<usize> {
 }
 
 /// (s, s') of live dimensions in units of the states, `[N, 2 d]`.
-fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
+pub(crate) fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
     let d = units.live.len();
     let (s, s2) = (units.states(&t.observations), units.states(&t.next_observations));
     Rows::join(&[(&s, d), (&s2, d)]).to_vec()

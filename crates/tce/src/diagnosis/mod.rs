@@ -5,6 +5,8 @@
 //! | rows over y_max: sampled, filtered, labelled, simulated | `rows.rs` |
 //! | abundant target rows, and the models that are compared | `models.rs` |
 //! | every figure of a diagnosis | `measures.rs` |
+//! | the policy that the generator implies | `implied.rs` |
+//! | the networks at the ends of q_tran's cycles (`tce diagnose generator --cycles`) | `cycles.rs` |
 //! | one sampler beside others (`tce diagnose generator`) | `generator.rs` |
 //! | the measures themselves | the crate `tce-diagnosis` |
 //!
@@ -27,8 +29,10 @@ use crate::generator::Generator;
 use crate::inputs::Inputs;
 use crate::stage::Stage;
 
+pub mod cycles;
 pub mod generator;
-mod measures;
+pub mod implied;
+pub(crate) mod measures;
 mod models;
 mod rows;
 
@@ -36,7 +40,7 @@ use measures::Work;
 use rows::Sampler;
 
 /// Changes when the same rows would give other figures.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
 
@@ -55,6 +59,8 @@ pub struct Options {
     pub value_steps: u64,
     /// Abundant target rows.
     pub abundant: usize,
+    /// Episodes of the policy that the generator implies.
+    pub episodes: usize,
 }
 
 impl Default for Options {
@@ -66,6 +72,7 @@ impl Default for Options {
             transition: TransitionConfig::default(),
             value_steps: 10_000,
             abundant: 100_000,
+            episodes: 10,
         }
     }
 }
@@ -140,7 +147,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     }
     let used = serde_json::json!({
         "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
-        "iql": config.learner.iql, "batch": config.learner.batch,
+        "iql": config.learner.iql, "batch": config.learner.batch, "scores": config.evaluation.scores,
     });
     let spec = Spec {
         version: VERSION,

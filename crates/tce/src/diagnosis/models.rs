@@ -233,6 +233,18 @@ impl Models {
         Rated { doubt, ..Rated::certain((0..t.len()).map(gap).collect()) }
     }
 
+    /// How far the thirds are apart in the successors of `t`, in steps ([`super::generator::step_errors`]): the mean over their pairs.
+    pub fn successors_apart(&self, t: &Transitions, step: &[f32], live: &[usize]) -> Vec<f64> {
+        let densities = self.densities(&t.observations, &t.actions);
+        let predicted = self.thirds.map(|m| self.transition.next_observations(&t.observations, &densities[m]));
+        let of = |a: usize, b: usize| {
+            let other = Transitions { next_observations: predicted[b].clone(), ..t.clone() };
+            super::generator::step_errors(&predicted[a], &other, step, live)
+        };
+        let all = [of(1, 0), of(2, 0), of(2, 1)];
+        (0..t.len()).map(|i| all.iter().map(|v| v[i]).sum::<f64>() / all.len() as f64).collect()
+    }
+
     /// Mean gap of target rows by the model that lacks them, and how far that is from the other two: how much of a model's error their
     /// disagreement shows.
     pub fn held_out(&self, target: &Transitions, agent: Option<Agent>) -> Option<(f64, f64)> {

@@ -9,6 +9,7 @@ use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
 
+use crate::diagnosis::cycles::{AtCycle, Cycles, cycles};
 use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
 use crate::error::Result;
 use crate::expand::{Finisher, label_models};
@@ -16,6 +17,7 @@ use crate::generator::Generator;
 use crate::inputs::{DataArgs, Inputs, Table};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
+use crate::variant::Variant;
 
 /// Arguments of `generator`.
 #[derive(Debug, Args)]
@@ -39,6 +41,13 @@ pub struct GeneratorArgs {
     /// The samplers, separated by commas: pc:STEPS, euler:STEPS, heun:STEPS, dpm:STEPS, sde-dpm:STEPS.
     #[arg(long, value_delimiter = ',', value_parser = sampler, default_value = "pc:500,heun:18,dpm:20")]
     samplers: Vec<Sampler>,
+    /// The networks at the ends of q_tran's training cycles instead, on all target rows and from the stage that `tce run` uses: losses,
+    /// consistency, implied actions and what the implied policy scores. For generator.transition_steps = "auto".
+    #[arg(long, conflicts_with_all = ["processes", "samplers", "only", "held_out"])]
+    cycles: bool,
+    /// Episodes of the implied policy for each network.
+    #[arg(long, default_value_t = 10, requires = "cycles")]
+    episodes: usize,
     /// Only the configured process and sampler instead.
     #[arg(long, conflicts_with_all = ["processes", "samplers"])]
     only: bool,
@@ -114,6 +123,9 @@ fn sampler_name(sampler: &Sampler) -> String {
 impl GeneratorArgs {
     /// Runs the subcommand.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
+        if self.cycles {
+            return self.cycles(output, device);
+        }
         let config = self.config.layered(Some(self.task), None)?.config()?;
         let inputs =
             Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows);
@@ -184,6 +196,47 @@ impl GeneratorArgs {
         output.print(&report, render);
         Ok(())
     }
+
+    fn cycles(self, output: Output, device: &Device) -> Result<()> {
+        let config = self.config.layered(Some(self.task), Some(Variant::TceOg))?.config()?;
+        let inputs = Inputs::of_config(self.task, &self.data, &config)?;
+        let place = (self.task.agent, self.task.shift);
+        let said = |n: &AtCycle| eprintln!("{}: action RMSE {}, score {}", n.cells()[0], n.cells()[4], n.cells()[10]);
+        let sizes = (self.rows, self.episodes);
+        let cycles = cycles(&inputs, &config, place, self.seed, sizes, &self.data.out, device, said)?;
+        output.print(&CyclesReport { task: self.task, episodes: self.episodes, cycles }, render_cycles);
+        Ok(())
+    }
+}
+
+#[derive(Serialize)]
+struct CyclesReport {
+    task: Task,
+    /// Episodes behind every score.
+    episodes: usize,
+    #[serde(flatten)]
+    cycles: Cycles,
+}
+
+fn render_cycles(r: &CyclesReport) -> String {
+    let c = &r.cycles;
+    let spread = c.networks.iter().find_map(|n| n.actions.trained).map_or(f64::NAN, |e| e.spread);
+    let behaviour = c.behaviour_score.map_or("unknown".into(), |s| format!("{s:.1}"));
+    format!(
+        "{}: q_tran of {}, trained on {} rows, {} held out; the target's actions spread by {spread:.3}, its data score {behaviour}\n\
+         consistency of real rows with inferred actions: {:.3} (p90 {:.3})\n{}\n\
+         Action RMSE: Inv(s, ŝ') with ŝ' of q_tran against the behaviour's own action, one draw and the mean of 8, at rows that q_tran saw \
+         and rows that it did not.\nScore: the policy s -> Inv(s, ŝ') over {} episodes. Networks are done when action RMSE and score no longer \
+         get better.",
+        r.task,
+        c.stage,
+        c.target_rows.0,
+        c.target_rows.1,
+        c.real.median,
+        c.real.p90,
+        table(&AtCycle::HEADER, c.networks.iter().map(AtCycle::cells)),
+        r.episodes
+    )
 }
 
 fn render(r: &Report) -> String {

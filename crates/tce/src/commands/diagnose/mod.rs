@@ -82,6 +82,9 @@ struct RunArgs {
     /// Abundant target rows to simulate.
     #[arg(long, default_value_t = Options::default().abundant)]
     abundant: usize,
+    /// Episodes of the policy that the generator implies, in the simulator.
+    #[arg(long, default_value_t = Options::default().episodes)]
+    episodes: usize,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -197,6 +200,7 @@ impl RunArgs {
             transition: TransitionConfig { steps: self.transition_steps, ..defaults.transition },
             value_steps: self.value_steps,
             abundant: self.abundant,
+            episodes: self.episodes,
         };
         let (diagnosis, place) = match &self.run {
             Some(directory) => {
@@ -297,6 +301,15 @@ fn render_run(written: &Written) -> String {
         text += &format!(
             "copies: a generated row is nearer to a training row than a held-out row with probability {:.2} (copies: {:.2}); {}\n",
             m.probability, m.of_copies, m
+        );
+    }
+    if let Some(implied) = &d.implied {
+        text += &format!("implied policy: {}\n", implied.sentence());
+    }
+    if let Some((first, last)) = d.error_over_distance.as_ref().and_then(|e| e.bins.first().zip(e.bins.last())) {
+        text += &format!(
+            "label error against distance: {:.3} steps at {:.1} times the usual distance between target states, {:.3} at {:.1} times (medians)\n",
+            first.error.median, first.distance, last.error.median, last.distance
         );
     }
     if let Some(c) = &d.choice {
