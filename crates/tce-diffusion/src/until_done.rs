@@ -14,7 +14,7 @@
 //! |---|---|---|---|
 //! | – | `first` | 7 500 | bench/generator.md |
 //! | – | `limit` | 120 000 | bench/generator.md |
-//! | – | `gain` | .05 | bench/generator.md |
+//! | – | `gain` | .1 | bench/generator.md |
 //! | c_k | the caller's `judge` | – | – |
 
 use std::path::Path;
@@ -43,7 +43,7 @@ pub struct UntilDone {
 
 impl Default for UntilDone {
     fn default() -> Self {
-        Self { first: 7_500, limit: 120_000, gain: 0.05 }
+        Self { first: 7_500, limit: 120_000, gain: 0.1 }
     }
 }
 

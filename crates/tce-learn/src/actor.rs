@@ -175,6 +175,20 @@ impl Actor {
     /// # Errors
     /// If a number of the configuration is out of range.
     pub fn new(buffer: &Buffer, config: &ActorConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
+        Self::named("policy", buffer, config, steps, device)
+    }
+
+    /// [`Actor::new`] with first weights from the members' streams `name`.
+    ///
+    /// # Errors
+    /// As [`Actor::new`].
+    pub fn named(
+        name: &str,
+        buffer: &Buffer,
+        config: &ActorConfig,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
         within("lr", config.lr, 0.0..=1.0)?;
         let (head, output_activation) = match config.form {
             PolicyForm::TanhMean => (Head::Mean, Activation::Tanh),
@@ -198,7 +212,7 @@ impl Actor {
         let log_std = matches!(config.form, PolicyForm::Gaussian)
             .then(|| Param::from_tensor(Tensor::zeros([specs.len(), 1, buffer.act_dim()], &device)));
         let mlp: MlpConfig = specs[0].network();
-        let net = ActorNet { mlp: mlp.init(&buffer.streams(), "policy", &device), log_std };
+        let net = ActorNet { mlp: mlp.init(&buffer.streams(), name, &device), log_std };
         Ok(Self { net: Trained::new(net), config: config.clone(), specs, steps })
     }
 

@@ -121,6 +121,49 @@ impl MlpPolicy {
         Ok(Self { spec, network })
     }
 
+    /// One network whose last layer gives the mean of what the last layers of `policies` give, before the output activation. Its hidden
+    /// layers are as wide as theirs together; between different policies all weights are zero.
+    ///
+    /// # Panics
+    /// If there are none, or they differ in more than their weights.
+    pub fn average(policies: &[&Self]) -> Self {
+        let (first, count) = (policies[0], policies.len());
+        assert!(policies.iter().all(|p| p.spec == first.spec), "policies of one kind");
+        let hidden: Vec<usize> = first.spec.hidden.iter().map(|h| h * count).collect();
+        let spec = PolicySpec { hidden, ..first.spec.clone() };
+        let all: Vec<NamedParameters> = policies.iter().map(|p| p.to_parameters()).collect();
+        let last = spec.hidden.len();
+        let mut wide = NamedParameters::default();
+        for layer in 0..=last {
+            let of = |part: &str| {
+                let name = format!("{KEY}.layers.{layer}.{part}");
+                let tensors = all.iter().map(|p| &p.tensors[&name]).collect::<Vec<_>>();
+                (name, tensors)
+            };
+            let (name, weights) = of("weight");
+            let (rows, columns) = (weights[0].0[1], weights[0].0[2]);
+            // The first layer's input and the last layer's output are shared.
+            let (down, across) = (if layer == 0 { 0 } else { rows }, if layer == last { 0 } else { columns });
+            let (tall, broad) = (rows + down * (count - 1), columns + across * (count - 1));
+            let share = if layer == last { 1.0 / count as f32 } else { 1.0 };
+            let mut values = vec![0.0; tall * broad];
+            for (k, (_, own)) in weights.iter().enumerate() {
+                for (i, row) in own.chunks_exact(columns).enumerate() {
+                    let start = (k * down + i) * broad + k * across;
+                    values[start..start + columns].iter_mut().zip(row).for_each(|(v, w)| *v += w * share);
+                }
+            }
+            wide.tensors.insert(name, (vec![1, tall, broad], values));
+            let (name, biases) = of("bias");
+            let mut values = vec![0.0; broad];
+            for (k, (_, own)) in biases.iter().enumerate() {
+                values[k * across..k * across + columns].iter_mut().zip(own).for_each(|(v, b)| *v += b * share);
+            }
+            wide.tensors.insert(name, (vec![1, 1, broad], values));
+        }
+        Self::new(spec, &wide, KEY, Path::new("an average")).expect("a network of this specification")
+    }
+
     /// What it is, without the weights.
     pub fn spec(&self) -> &PolicySpec {
         &self.spec
@@ -230,6 +273,30 @@ mod tests {
         match from_population(vec![spec], &network).remove(0) {
             Policy::Mlp(policy) => *policy,
             other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn an_average_acts_by_the_mean_output() {
+        let tanh = PolicySpec { output_activation: Activation::Tanh, hidden: vec![16, 8], ..spec(Head::Mean) };
+        let policies = [5, 6, 7].map(|seed| {
+            let network = tanh.network().init(&[Streams::new(seed)], "policy", &cpu());
+            match from_population(vec![tanh.clone()], &network).remove(0) {
+                Policy::Mlp(policy) => *policy,
+                other => panic!("{other:?}"),
+            }
+        });
+        let average = MlpPolicy::average(&policies.iter().collect::<Vec<_>>());
+        assert_eq!(average.spec().hidden, [48, 24]);
+        let act = |p: &MlpPolicy| {
+            let mut actions = vec![0.0; 8];
+            p.act(&observations(4), None, &mut actions);
+            actions
+        };
+        let each = policies.each_ref().map(act);
+        for (k, a) in act(&average).iter().enumerate() {
+            let expected = (each.iter().map(|e| f64::from(e[k]).atanh()).sum::<f64>() / 3.0).tanh();
+            assert!((f64::from(*a) - expected).abs() < 1e-5, "{a} {expected}");
         }
     }
 

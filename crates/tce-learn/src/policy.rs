@@ -70,6 +70,26 @@ impl Policy {
         Ok(self.to_parameters().save(path)?)
     }
 
+    /// The policy whose action is that of the mean output of `policies` ([`MlpPolicy::average`]); the first one where it is alone or
+    /// remembers something.
+    ///
+    /// # Panics
+    /// If there is none, or they differ in more than their weights.
+    pub fn average(policies: &[&Self]) -> Self {
+        let networks: Option<Vec<&MlpPolicy>> = policies.iter().map(|p| p.as_mlp()).collect();
+        match networks {
+            Some(networks) if networks.len() > 1 => Self::Mlp(Box::new(MlpPolicy::average(&networks))),
+            _ => policies[0].clone(),
+        }
+    }
+
+    fn as_mlp(&self) -> Option<&MlpPolicy> {
+        match self {
+            Self::Mlp(policy) => Some(policy),
+            Self::Sequence(_) => None,
+        }
+    }
+
     /// Lengths of an observation and of an action.
     pub fn dims(&self) -> (usize, usize) {
         match self {

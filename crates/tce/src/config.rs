@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target, UntilDone};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDtConfig, Mode,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDtConfig, Mode,
     OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
@@ -24,6 +24,9 @@ pub struct Config {
     pub generator: GeneratorConfig,
     pub filter: FilterConfig,
     pub labels: LabelsConfig,
+    /// Runs that were done before there was this table used no learned dynamics.
+    #[serde(default)]
+    pub dynamics: DynamicsConfig,
     pub joint: JointConfig,
     pub mixture: MixtureConfig,
     pub learner: LearnerConfig,
@@ -36,6 +39,20 @@ pub struct Config {
 #[allow(missing_docs)]
 pub struct TargetConfig {
     pub rows: usize,
+    /// Runs that were done before there was this key imitate all of them.
+    #[serde(default)]
+    pub trajectories: Trajectories,
+}
+
+/// Which of the target's trajectories are imitated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Trajectories {
+    /// All of them.
+    #[default]
+    All,
+    /// The better ones, where the returns show two behaviours ([`tce_data::choose_trajectories`]); else all of them.
+    Auto,
 }
 
 /// Source data that a task does not bring along.
@@ -65,6 +82,9 @@ pub struct GeneratorConfig {
     pub ema: f64,
     pub balanced: bool,
     pub source_states: bool,
+    /// Runs that were done before there was this key did without.
+    #[serde(default)]
+    pub support: bool,
     pub y_max: f32,
     pub rows: usize,
 }
@@ -123,7 +143,8 @@ pub struct UntilDoneConfig {
     pub state_limit: u64,
     /// Updates that all cycles of q_tran together may take.
     pub transition_limit: u64,
-    /// Share by which the held-out loss has to fall in a cycle for another one to follow.
+    /// Share by which a cycle has to lower q_mix's held-out loss, or the error of the actions that q_tran implies at held-out
+    /// states, for another one to follow.
     pub gain: f64,
     /// Share of the target rows that is held out.
     pub held_out: f64,
@@ -131,7 +152,7 @@ pub struct UntilDoneConfig {
 
 impl Default for UntilDoneConfig {
     fn default() -> Self {
-        Self { first: 7_500, state_limit: 60_000, transition_limit: 120_000, gain: 0.05, held_out: 0.05 }
+        Self { first: 7_500, state_limit: 60_000, transition_limit: 120_000, gain: 0.1, held_out: 0.05 }
     }
 }
 
@@ -147,13 +168,50 @@ impl UntilDoneConfig {
     }
 }
 
-/// Z-score filtering (Eq. 8).
+/// Which generated rows are left out.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct FilterConfig {
     pub enabled: bool,
+    #[serde(default, skip_serializing_if = "FilterKind::is_zscore")]
+    pub kind: FilterKind,
     pub z_threshold: f64,
+    /// In runs that were done before there was this key the z-score decides.
+    #[serde(default = "FilterConfig::default_margin", skip_serializing_if = "FilterConfig::is_default_margin")]
+    pub margin: f64,
+}
+
+impl FilterConfig {
+    /// Whether learned dynamics tell which rows stay.
+    pub fn by_dynamics(&self) -> bool {
+        self.enabled && self.kind == FilterKind::Consistency
+    }
+
+    fn default_margin() -> f64 {
+        2.0
+    }
+
+    fn is_default_margin(margin: &f64) -> bool {
+        *margin == Self::default_margin()
+    }
+}
+
+/// By what rows are told to be bad.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FilterKind {
+    /// A dimension far from the mean of the generated rows (Eq. 8). It cuts the start of every episode.
+    #[default]
+    Zscore,
+    /// A successor far from what models of both domains' dynamics expect of the row's state and action.
+    Consistency,
+}
+
+impl FilterKind {
+    fn is_zscore(&self) -> bool {
+        *self == Self::Zscore
+    }
 }
 
 /// Inverse dynamics and reward models, and where terminal flags come from.
@@ -387,6 +445,7 @@ impl LearnerConfig {
         let iql = self.backbone().unwrap_or_else(|| iql.clone());
         let checks = [
             ("iql", iql.check()),
+            ("bc", self.bc.check()),
             ("td3_bc", td3_bc.check()),
             ("rebrac", rebrac.check()),
             ("dara", dara.check()),
@@ -431,9 +490,11 @@ impl Config {
         within("mixture.lambda", self.mixture.lambda, 0.0, 1.0)?;
         within("learner.top", self.learner.top, 0.001, 1.0)?;
         within("filter.z_threshold", self.filter.z_threshold, 0.1, 1e9)?;
+        within("filter.margin", self.filter.margin, 0.01, 1e9)?;
         for (key, value) in [
             ("source.rows", self.source.rows),
             ("generator.batch", self.generator.batch),
+            ("dynamics.batch", self.dynamics.batch),
             ("labels.training.batch", self.labels.training.batch),
             ("learner.batch", self.learner.batch),
             ("evaluation.episodes", self.evaluation.episodes),

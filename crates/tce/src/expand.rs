@@ -7,17 +7,18 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_data::{Agent, LoadOptions, Rows, Standardizer, Transitions, load, save_d4rl, zscore_keep};
+use tce_data::{Agent, LoadOptions, Rows, Standardizer, Support, Transitions, load, save_d4rl, zscore_keep};
 use tce_diffusion::Chunks;
 use tce_learn::{LabelConfig, LabelErrors, LabelModels, Labelled, Learner, Member, TerminalHandling, train_labels};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::terminal_rule;
 
-use crate::config::{Config, FilterConfig, GeneratedRows, LabelsConfig, Terminal};
+use crate::config::{Config, FilterConfig, FilterKind, GeneratedRows, LabelsConfig, Terminal};
 use crate::error::{Error, Result};
 use crate::generator::Generator;
 use crate::inputs::{InputSpec, Inputs};
 use crate::joint;
+use crate::judge::Judge;
 use crate::stage::Stage;
 use crate::units::Units;
 
@@ -112,7 +113,7 @@ impl<'a> Finisher<'a> {
             .zip(successors.chunks_exact(d))
             .map(|(s, s2)| s.iter().chain(s2).all(|v| v.is_finite()));
         let mut keep: Vec<bool> = finite.collect();
-        if self.filter.enabled {
+        if self.filter.enabled && self.filter.kind == FilterKind::Zscore {
             let (states, successors) = (choose(states, d, &keep), choose(successors, d, &keep));
             let pairs = Rows::join(&[(&states, d), (&successors, d)]);
             let inliers = zscore_keep(&pairs, self.filter.z_threshold);
@@ -152,8 +153,11 @@ impl<'a> Finisher<'a> {
 
 /// Of `rows` generated rows none is left.
 pub(crate) fn everything_rejected(rows: usize, filter: &FilterConfig) -> Error {
-    let threshold = filter.z_threshold;
-    Error::Failed(format!("the filter rejected all {rows} generated rows; is filter.z_threshold = {threshold} meant?"))
+    let threshold = match filter.kind {
+        FilterKind::Zscore => format!("z_threshold = {}", filter.z_threshold),
+        FilterKind::Consistency => format!("margin = {}", filter.margin),
+    };
+    Error::Failed(format!("the filter rejected all {rows} generated rows; is filter.{threshold} meant?"))
 }
 
 fn choose(rows: &[f32], d: usize, keep: &[bool]) -> Vec<f32> {
@@ -185,6 +189,16 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     }
 }
 
+/// What the observations of both domains respect.
+fn support(inputs: &Inputs) -> Support {
+    let tables = std::iter::once(&inputs.target).chain(&inputs.source);
+    let rows: Vec<&[f32]> =
+        tables.flat_map(|t| [t.rows.observations.as_slice(), t.rows.next_observations.as_slice()]).collect();
+    let support = Support::fit(&rows, inputs.target.rows.obs_dim);
+    support.describe().iter().for_each(|finding| eprintln!("generated rows respect: {finding}"));
+    support
+}
+
 /// Runs, or takes from its stage, TCE's whole expansion.
 fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
     #[derive(Serialize)]
@@ -194,21 +208,32 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         sampler: tce_diffusion::Sampler,
         y_max: f32,
         rows: usize,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        support: bool,
+        /// The models that filter, where any do.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        dynamics: Option<String>,
         filter: &'a FilterConfig,
         terminal: Terminal,
     }
-    let (generator, networks, _) = Generator::train(inputs, &config.generator, seeds, root, device)?;
+    let (generator, networks, _) = Generator::train(inputs, config, seeds, root, device)?;
     let (models, labels, label_errors) = label_models(inputs, &config.labels, seeds, root, device)?;
     let rows = match config.generator.rows {
         0 => ((1.0 - config.mixture.lambda) * inputs.source_rows()?.len() as f64).round() as usize,
         rows => rows,
     };
+    let judge = match config.filter.by_dynamics() {
+        true => Some(Judge::train(inputs, &config.dynamics, root, device)?),
+        false => None,
+    };
     let spec = Spec {
         networks: networks.name(),
         labels: labels.name(),
+        dynamics: judge.as_ref().map(|j| j.stage.name()),
         sampler: config.generator.sampler,
         y_max: config.generator.y_max,
         rows,
+        support: config.generator.support,
         filter: &config.filter,
         terminal: config.labels.terminal,
     };
@@ -222,13 +247,30 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         None => {
             let attempt = stage.attempt()?;
             let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
-            let target = &inputs.target.rows;
+            let target = &*inputs.imitated(&config.target);
+            let support = config.generator.support.then(|| support(inputs));
             let kept = Chunks { directory: attempt.directory(), key: attempt.key() };
-            let (states, successors) = generator.sample_pairs(rows, &config.generator, &members, target, Some(kept))?;
+            let (states, successors) = generator.sample_pairs(
+                rows,
+                &config.generator,
+                &members,
+                target,
+                support.as_ref(),
+                Some(kept),
+            )?;
             let finisher = Finisher::new(&generator.units, &models, config, inputs);
             let per_member = rows * generator.units.live.len();
             let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
-            let finished = finisher.finish(&pairs)?;
+            let mut finished = finisher.finish(&pairs)?;
+            if let Some(judge) = &judge {
+                for labelled in &mut finished {
+                    let keep = judge.possible(&labelled.transitions, config.filter.margin);
+                    if keep.is_empty() {
+                        return Err(everything_rejected(rows, &config.filter));
+                    }
+                    labelled.transitions = labelled.transitions.select(&keep);
+                }
+            }
             drop((states, successors));
             let (mut reports, mut tables) = (Vec::new(), Vec::new());
             for ((&seed, labelled), errors) in seeds.iter().zip(finished).zip(&label_errors) {

@@ -9,15 +9,17 @@ use std::sync::{Mutex, PoisonError};
 use serde::{Deserialize, Serialize};
 use tce_base::random::choose;
 use tce_base::{Progress, Streams};
-use tce_data::Transitions;
+use tce_data::{Support, Transitions};
 use tce_diffusion::{
     Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Process, Request, Sampler, Schedule, ScoreData,
     ScoreModel, Target, TrainConfig, Trainer, UntilDone, uniform_labels,
 };
+use tce_learn::{LabelModels, rmse};
 use tce_nn::{Checkpoints, Device, is_cpu};
 
-use crate::config::{GeneratorConfig, Length, UntilDoneConfig};
+use crate::config::{Config, GeneratorConfig, Length, UntilDoneConfig};
 use crate::error::{Error, Result};
+use crate::expand::label_models;
 use crate::inputs::Inputs;
 use crate::metrics::Metrics;
 use crate::stage::{Attempt, Stage};
@@ -56,6 +58,9 @@ pub struct Trained {
 #[derive(Serialize)]
 struct TrainingSpec<'a> {
     inputs: crate::inputs::InputSpec,
+    /// The models by whose actions q_tran is judged.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    labels: Option<String>,
     seeds: &'a [u64],
     process: Process,
     target: Target,
@@ -75,14 +80,20 @@ impl Generator {
     /// Trains the networks, or takes them from the stage under `root` if they are there.
     pub fn train(
         inputs: &Inputs,
-        config: &GeneratorConfig,
+        config: &Config,
         seeds: &[u64],
         root: &std::path::Path,
         device: &Device,
     ) -> Result<(Self, Stage, Trained)> {
-        let g = config;
+        let g = &config.generator;
+        // Inferred actions tell when q_tran is done.
+        let judge = match g.transition_steps {
+            Length::Auto => Some(label_models(inputs, &config.labels, seeds, root, device)?),
+            Length::Steps(_) => None,
+        };
         let spec = TrainingSpec {
-            inputs: inputs.spec(g.source_states),
+            inputs: inputs.spec_imitated(g.source_states, &config.target),
+            labels: judge.as_ref().map(|(_, stage, _)| stage.name()),
             seeds,
             process: g.process,
             target: g.target,
@@ -109,7 +120,7 @@ impl Generator {
         }
         let started = std::time::Instant::now();
         let attempt = stage.attempt()?;
-        let (generator, mut trained) = Self::train_now(inputs, config, seeds, device, &attempt)?;
+        let (generator, mut trained) = Self::train_now(inputs, config, judge.as_ref().map(|j| &j.0), seeds, device, &attempt)?;
         trained.seconds = started.elapsed().as_secs_f64();
         generator.state.save(&attempt.file(files[0]))?;
         generator.transition.save(&attempt.file(files[1]))?;
@@ -122,14 +133,15 @@ impl Generator {
 
     fn train_now(
         inputs: &Inputs,
-        config: &GeneratorConfig,
+        config: &Config,
+        models: Option<&LabelModels>,
         seeds: &[u64],
         device: &Device,
         attempt: &Attempt,
     ) -> Result<(Self, Trained)> {
-        let g = config;
+        let g = &config.generator;
         let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
-        let target = &inputs.target.rows;
+        let target = &*inputs.imitated(&config.target);
         let source = if g.source_states { Some(inputs.source_rows()?) } else { None };
         let units = Units::fit(target, source, g.target);
         let d = units.live.len();
@@ -156,20 +168,40 @@ impl Generator {
             }
         };
         let transition_data = ScoreData::conditioned(&outputs, d, &target_states, d)?;
-        let label = Condition::Constant(vec![0.0]);
+        let probe_states = match held_out.is_empty() {
+            true => None,
+            false => {
+                let part = Part { rows: &held_out_states, condition: Condition::Constant(vec![0.0]) };
+                Some(ScoreData::new(vec![part], d, 1, false)?)
+            }
+        };
+        let probe_successors = match held_out.is_empty() {
+            true => None,
+            false => Some(ScoreData::conditioned(&held_out_outputs, d, &held_out_states, d)?),
+        };
+        let losses = |trainer: &Trainer, probe: &Option<ScoreData>, data: &ScoreData| -> Result<Figures> {
+            let of = |data: &ScoreData| trainer.loss_on(std::slice::from_ref(data), PROBE_BATCHES);
+            let held_out = probe.as_ref().map(of).transpose()?;
+            Ok(held_out.map(|l| ("held_out_loss", l)).into_iter().chain([("training_loss", of(data)?)]).collect())
+        };
+        let judge_states = |trainer: &Trainer| losses(trainer, &probe_states, &state_data);
+        // What a learner will see are actions, so that they decide: the held-out loss of q_tran rises long before they are right.
+        let apart = target.select(&held_out);
+        let judge_successors = |trainer: &Trainer| -> Result<Figures> {
+            let models = models.ok_or_else(|| Error::Failed("q_tran cannot be judged without label models".into()))?;
+            let model = trainer.model();
+            let errors = implied_errors(&units, &model, models, &apart, &g.sampler, &members, target)?;
+            let mut figures = vec![("implied_action_error", errors)];
+            figures.extend(losses(trainer, &probe_successors, &transition_data)?);
+            Ok(figures)
+        };
         let state_course = match g.state_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone {
-                plan: g.until_done.state(),
-                probe: ScoreData::new(vec![Part { rows: &held_out_states, condition: label }], d, 1, false)?,
-            },
+            Length::Auto => Course::UntilDone { plan: g.until_done.state(), judge: &judge_states },
         };
         let transition_course = match g.transition_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone {
-                plan: g.until_done.transition(),
-                probe: ScoreData::conditioned(&held_out_outputs, d, &held_out_states, d)?,
-            },
+            Length::Auto => Course::UntilDone { plan: g.until_done.transition(), judge: &judge_successors },
         };
         let mut state = Trainer::new("state", NetworkConfig::new(d, 1), g.process, train, &members, device)?;
         let mut transition = Trainer::new("transition", NetworkConfig::new(d, d), g.process, train, &members, device)?;
@@ -271,19 +303,58 @@ impl Generator {
         Ok(out)
     }
 
-    /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, y_max) and their successors.
+    /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, y_max) and their successors, both
+    /// within the `support`.
     pub fn sample_pairs(
         &self,
         rows: usize,
         config: &GeneratorConfig,
         members: &[Streams],
         target: &Transitions,
+        support: Option<&Support>,
         kept: Option<Chunks>,
     ) -> Result<(Vec<f32>, Vec<f32>)> {
-        let states = self.sample_states(rows, config.y_max, &config.sampler, members, target, kept)?;
-        let successors = self.sample_successors(&states, &config.sampler, members, target, kept)?;
+        let respect = |rows: Vec<f32>| match support {
+            Some(support) => self.units.within(support, &rows),
+            None => rows,
+        };
+        let states = respect(self.sample_states(rows, config.y_max, &config.sampler, members, target, kept)?);
+        let successors = respect(self.sample_successors(&states, &config.sampler, members, target, kept)?);
         Ok((states, successors))
     }
+}
+
+/// Successors drawn at every held-out state.
+const PROBE_DRAWS: usize = 4;
+
+/// The error of the actions that q_tran implies at the states of `rows`, per member: RMSE of Inv(s, ŝ') against the row's own action. The
+/// same noise at every call.
+fn implied_errors(
+    units: &Units,
+    model: &ScoreModel,
+    models: &LabelModels,
+    rows: &Transitions,
+    sampler: &Sampler,
+    members: &[Streams],
+    target: &Transitions,
+) -> Result<Vec<f64>> {
+    let d = units.live.len();
+    let states = units.take(&rows.observations).repeat(PROBE_DRAWS);
+    let streams: Vec<_> = members.iter().map(|m| m.child("until done")).collect();
+    let training = || units.output.apply(&units.target.encode(&units.take(&target.observations), &units.take(&target.next_observations)));
+    let n = states.len() / d;
+    let start = start_rows(model.process(), training, d, n, &streams, "successor");
+    let condition = units.state.apply(&states);
+    let request =
+        Request { name: "successor", rows: n, condition: &condition, guidance: None, start: start.as_deref(), kept: None };
+    let mut out = model.sample(request, sampler, &streams, None)?;
+    units.output.invert_in_place(&mut out);
+    let (whole, own) = (rows.observations.repeat(PROBE_DRAWS), rows.actions.repeat(PROBE_DRAWS));
+    let error = |(m, out): (usize, &mut [f32])| {
+        units.target.decode(&states, out);
+        Ok(rmse(&models.actions(m, &whole, &units.put_back(out))?, &own))
+    };
+    out.chunks_exact_mut(n * d).enumerate().map(error).collect()
 }
 
 /// Training rows (width `d`) for processes that start at data, `[P, rows, d]`; the others need none.
@@ -339,16 +410,20 @@ pub(crate) fn held_out_rows(n: usize, config: &GeneratorConfig) -> (Vec<usize>, 
     hold_out_runs(n, if auto { config.until_done.held_out } else { 0.0 })
 }
 
+/// Figures of a network at the end of a cycle, one number per member each. The first one decides when the training is done; the less
+/// the better.
+pub(crate) type Figures = Vec<(&'static str, Vec<f64>)>;
+
 /// How long a network is trained.
 pub(crate) enum Course<'a> {
     /// So many updates.
     Steps(u64),
-    /// Until its loss on rows that it does not see no longer falls.
+    /// Until the first of its figures no longer falls.
     UntilDone {
         /// The cycles.
         plan: UntilDone,
-        /// The rows.
-        probe: ScoreData<'a>,
+        /// Measures the network.
+        judge: &'a (dyn Fn(&Trainer) -> Result<Figures> + Sync),
     },
 }
 
@@ -399,13 +474,12 @@ pub(crate) fn run(
             trainer.train(data, *steps, checkpoints, on_loss)?;
             (trainer.model(), Vec::new())
         }
-        Course::UntilDone { plan, probe } => {
+        Course::UntilDone { plan, judge } => {
             let judge = |trainer: &Trainer| -> Result<Vec<f64>> {
-                let held_out = trainer.loss_on(std::slice::from_ref(probe), PROBE_BATCHES)?;
-                log(trainer.steps(), "training_loss", &trainer.loss_on(data, PROBE_BATCHES)?);
-                log(trainer.steps(), "held_out_loss", &held_out);
+                let figures = judge(trainer)?;
+                figures.iter().for_each(|(figure, values)| log(trainer.steps(), figure, values));
                 trainer.model().save(&attempt.file(&cycle_file(name, trainer.steps())))?;
-                Ok(held_out)
+                Ok(figures.into_iter().next().map(|(_, values)| values).unwrap_or_default())
             };
             trainer.train_until_done(data, plan, checkpoints, on_loss, judge)?
         }

@@ -1,17 +1,19 @@
 //! The two data sets of a run: found, loaded, and refused together if they do not fit.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use tce_base::sha256_file;
 use tce_data::{
-    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions, ensure_same_agent,
+    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions, choose_trajectories,
+    Choice, ensure_same_agent,
     infer_agents, load, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
 
 use crate::actors::{Cast, Recipe};
-use crate::config::Config;
+use crate::config::{Config, TargetConfig, Trajectories};
 use crate::error::{Error, Result};
 use crate::stand_ins::{self, shared_folder};
 use crate::zoo;
@@ -96,6 +98,9 @@ pub struct InputSpec {
     shift: Option<Shift>,
     target: String,
     source: Option<String>,
+    /// The rows that are imitated, where they are not all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    chosen: Option<String>,
 }
 
 fn table(path: &Path, dims: Option<(usize, usize)>) -> Result<Table> {
@@ -150,6 +155,27 @@ impl Inputs {
         self
     }
 
+    /// The trajectories to imitate, where `config` wants the better ones and the returns show two behaviours; None: all of them.
+    pub fn choice(&self, config: &TargetConfig) -> Option<Choice> {
+        let wanted = config.trajectories == Trajectories::Auto;
+        wanted.then(|| choose_trajectories(&self.target.rows)).filter(Choice::is_selective)
+    }
+
+    /// The target rows that are imitated: by the generator, and by learners. What only has to know the dynamics (label models, learned
+    /// dynamics) takes all target rows.
+    pub fn imitated(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
+        match self.choice(config) {
+            Some(choice) => Cow::Owned(self.target.rows.select(&choice.rows)),
+            None => Cow::Borrowed(&self.target.rows),
+        }
+    }
+
+    /// [`Inputs::spec`] of work that sees the imitated rows alone.
+    pub fn spec_imitated(&self, with_source: bool, config: &TargetConfig) -> InputSpec {
+        let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
+        InputSpec { chosen, ..self.spec(with_source) }
+    }
+
     fn checked(self) -> Result<Self> {
         if let Some(source) = &self.source {
             ensure_same_agent(&source.rows, &self.target.rows)?;
@@ -164,6 +190,7 @@ impl Inputs {
             shift: self.shift,
             target: self.target.hash.clone(),
             source: self.source.as_ref().filter(|_| with_source).map(|s| s.hash.clone()),
+            chosen: None,
         }
     }
 

@@ -30,6 +30,8 @@ use crate::units::even_standardizer;
 
 /// States from which a policy is tried, for each network of the ensemble.
 const STARTS: usize = 32;
+/// Share of the target rows that the ensemble does not see.
+const HELD_OUT: f64 = 0.05;
 /// A state further outside of everything seen than this share of a column's range ends an imagined episode.
 const MARGIN: f32 = 0.25;
 
@@ -70,7 +72,6 @@ impl Judge {
     pub fn train(
         inputs: &Inputs,
         config: &DynamicsConfig,
-        held_out: f64,
         root: &Path,
         device: &Device,
     ) -> Result<Self> {
@@ -80,10 +81,10 @@ impl Judge {
             config: &'a DynamicsConfig,
             held_out: f64,
         }
-        let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out };
+        let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out: HELD_OUT };
         let stage = Stage::open(root, "stages/dynamics", &spec, device)?;
         let target = &inputs.target.rows;
-        let (kept, apart) = hold_out_runs(target.len(), held_out);
+        let (kept, apart) = hold_out_runs(target.len(), HELD_OUT);
         let source = inputs.source.as_ref().map(|s| Arc::new(s.rows.clone()));
         let scale = even_standardizer(target, source.as_deref());
         let training = Arc::new(target.select(&kept));
@@ -120,6 +121,19 @@ impl Judge {
             high,
             limit,
         })
+    }
+
+    /// The rows whose successor is no further from what the ensemble expects than `margin` times what 95 % of held-out real rows are.
+    pub fn possible(&self, rows: &Transitions, margin: f64) -> Vec<usize> {
+        let threshold = margin * self.held_out_error(0.95);
+        let errors = self.dynamics.errors(rows, Domain::Target);
+        (0..rows.len()).filter(|&i| errors[i] <= threshold).collect()
+    }
+
+    /// A quantile of the errors on held-out target rows, in steps.
+    pub fn held_out_error(&self, quantile: f64) -> f64 {
+        let last = self.held_out.len().saturating_sub(1) as f64;
+        self.held_out.get((last * quantile) as usize).copied().unwrap_or(f64::NAN)
     }
 
     /// Tries a policy.

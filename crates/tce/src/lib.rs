@@ -29,6 +29,7 @@ mod study;
 mod sweep;
 mod units;
 mod variant;
+mod verdict;
 mod video;
 mod zoo;
 

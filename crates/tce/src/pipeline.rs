@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use tce_base::{write_atomically, write_json};
-use tce_learn::Mode;
+use tce_learn::{DynamicsConfig, Mode};
 use tce_nn::Device;
 
 use crate::actors::{Arena, Evaluation};
@@ -50,6 +50,18 @@ pub struct Summary {
     pub data: Vec<PathBuf>,
 }
 
+impl Summary {
+    /// The policies' files, one per seed.
+    pub fn policies(&self) -> Vec<PathBuf> {
+        self.seeds.iter().map(|seed| self.directory.join(policy_file(*seed))).collect()
+    }
+}
+
+/// The file of the policy of a seed.
+fn policy_file(seed: u64) -> String {
+    format!("policy-seed{seed}.safetensors")
+}
+
 /// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
 #[derive(Serialize)]
 struct RunSpec<'a> {
@@ -61,6 +73,8 @@ struct RunSpec<'a> {
     generator: Option<&'a GeneratorConfig>,
     filter: Option<&'a FilterConfig>,
     labels: Option<&'a LabelsConfig>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dynamics: Option<&'a DynamicsConfig>,
     joint: Option<serde_json::Value>,
 }
 
@@ -77,7 +91,9 @@ impl Config {
     pub fn needs_source(&self) -> bool {
         let generating = match self.mixture.generated {
             GeneratedRows::None | GeneratedRows::Synther => false,
-            GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0,
+            GeneratedRows::Tce => {
+                self.generator.source_states || self.generator.rows == 0 || self.filter.by_dynamics()
+            }
             GeneratedRows::Dmc => true,
         };
         generating || self.mixture.source != SourceRows::None || self.learner.algorithm == Algorithm::Dmc
@@ -125,7 +141,7 @@ pub fn run(
     let two_stages = config.mixture.generated == GeneratedRows::Tce;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
     let spec = RunSpec {
-        inputs: inputs.spec(config.needs_source()),
+        inputs: inputs.spec_imitated(config.needs_source(), &config.target),
         seeds,
         mixture: &config.mixture,
         learner: config.learner.used(),
@@ -133,6 +149,7 @@ pub fn run(
         generator: two_stages.then_some(&config.generator),
         filter: two_stages.then_some(&config.filter),
         labels: (two_stages || relabelled).then_some(&config.labels),
+        dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
         joint: config.joint.used(config.mixture.generated, config.learner.algorithm),
     };
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
@@ -163,7 +180,10 @@ pub fn run(
     let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
     drop((tables, models));
 
-    let target = Arc::new(inputs.target.rows.clone());
+    if let Some(choice) = inputs.choice(&config.target) {
+        eprintln!("{name}: {}", choice.reason);
+    }
+    let target = Arc::new(inputs.imitated(&config.target).into_owned());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
         // Generated rows among them are no trajectories.
@@ -192,7 +212,7 @@ pub fn run(
     let place = (attempt.directory(), attempt.key());
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         for (policy, seed) in policies.iter().zip(seeds) {
-            let file = format!("policy-seed{seed}.safetensors");
+            let file = policy_file(*seed);
             policy.save(&attempt.file(&file))?;
             files.push(file);
         }

@@ -1,7 +1,7 @@
 //! Between the units of the data and those of the networks.
 
 use serde::{Deserialize, Serialize};
-use tce_data::{Rows, Standardizer, Transitions};
+use tce_data::{Rows, Standardizer, Support, Transitions};
 use tce_diffusion::Target;
 
 /// The map under which states of a half-and-half batch have zero mean and unit variance: target and other rows count the
@@ -75,6 +75,13 @@ impl Units {
             self.live.iter().zip(row).for_each(|(&k, &v)| out[start + k] = v);
         }
         out
+    }
+
+    /// Live dimensions of states that respect what the data respect.
+    pub fn within(&self, support: &Support, live: &[f32]) -> Vec<f32> {
+        let mut whole = self.put_back(live);
+        support.apply(&mut whole);
+        self.take(&whole)
     }
 
     /// Live, standardised states.

@@ -70,11 +70,14 @@ pub enum Variant {
     Bc,
     /// Behaviour cloning of the best half of the target trajectories, observations standardised.
     BcTop,
+    /// The mean of five clones of the target rows, observations standardised: what TCE's policy is without generated rows.
+    BcEnsemble,
 }
 
 impl Variant {
     /// The floors that stand beside every result.
-    pub const FLOORS: [Variant; 4] = [Variant::BcRaw, Variant::Bc, Variant::BcTop, Variant::TargetOnly];
+    pub const FLOORS: [Variant; 5] =
+        [Variant::BcRaw, Variant::Bc, Variant::BcTop, Variant::TargetOnly, Variant::BcEnsemble];
 
     /// The name on the command line and in files.
     pub fn name(self) -> String {
@@ -106,6 +109,7 @@ impl Variant {
             Variant::BcRaw => "BC, raw observations",
             Variant::Bc => "BC, standardised",
             Variant::BcTop => "BC, best half",
+            Variant::BcEnsemble => "BC, ensemble of 5",
         }
     }
 
@@ -134,12 +138,19 @@ impl Variant {
 
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
     pub(crate) fn layer(self, lambda: f64, shift: Option<Shift>) -> String {
+        // What is not TCE imitates all trajectories, as published.
+        let rows = |generated: &str, source: &str, lambda: f64| {
+            let all = if generated == "tce" { "" } else { "target.trajectories = \"all\"\n" };
+            format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n{all}")
+        };
+        // IQL without TCE's regulariser.
         let iql = |generated: &str, source: &str, lambda: f64| {
-            format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n")
+            let learner = "learner.algorithm = \"iql\"\nlearner.iql.regulariser = \"none\"\n";
+            rows(generated, source, lambda) + learner
         };
         let rival = |algorithm: &str, table: &str, rest: &str| {
             // As many generated rows as source rows, as where DmC generates a million beside a million; it does so for smaller sources, too.
-            let mixture = if table == "dmc" { iql("dmc", "all", 0.5) } else { iql("none", "all", 1.0) };
+            let mixture = if table == "dmc" { rows("dmc", "all", 0.5) } else { rows("none", "all", 1.0) };
             format!("{mixture}learner.algorithm = {algorithm:?}\nlearner.iql.regulariser = \"none\"\n")
                 + rest
                 + &match self.name().ends_with("-published") {
@@ -149,34 +160,36 @@ impl Variant {
         };
         // OTDF's own choice of its β_reg.
         let beta_reg = if shift == Some(Shift::Kinematic) { "learner.otdf.beta_reg = 0.1\n" } else { "" };
-        let bc = |rest: &str| format!("{}learner.algorithm = \"bc\"\n{rest}", iql("none", "none", 0.0));
+        let bc = |ensemble: usize, rest: &str| {
+            let learner = format!("learner.algorithm = \"bc\"\nlearner.bc.ensemble = {ensemble}\n");
+            rows("none", "none", 0.0) + &learner + rest
+        };
         match self {
-            Variant::TceOg => iql("tce", "none", 0.0),
-            Variant::TceNn => iql("tce", "nearest", lambda),
-            Variant::TceOt => iql("tce", "transport", lambda),
+            Variant::TceOg => rows("tce", "none", 0.0),
+            Variant::TceNn => rows("tce", "nearest", lambda),
+            Variant::TceOt => rows("tce", "transport", lambda),
             Variant::SimpleAug => {
-                format!("{}generator.y_max = 0.0\ngenerator.source_states = false\n", iql("tce", "none", 0.0))
+                rows("tce", "none", 0.0) + "generator.y_max = 0.0\ngenerator.source_states = false\n"
             }
-            Variant::TargetOnly => {
-                format!("{}learner.standardise = true\nlearner.iql.regulariser = \"none\"\n", iql("none", "none", 0.0))
-            }
-            Variant::TargetSource => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "all", 1.0)),
-            Variant::IqlSwt => format!("{}learner.iql.regulariser = \"none\"\n", iql("none", "relabelled", 1.0)),
-            Variant::TceNoFilter => format!("{}filter.enabled = false\n", iql("tce", "none", 0.0)),
-            Variant::TceNoReg => format!("{}learner.iql.regulariser = \"none\"\n", iql("tce", "none", 0.0)),
+            Variant::TargetOnly => iql("none", "none", 0.0) + "learner.standardise = true\n",
+            Variant::TargetSource => iql("none", "all", 1.0),
+            Variant::IqlSwt => iql("none", "relabelled", 1.0),
+            Variant::TceNoFilter => rows("tce", "none", 0.0) + "filter.enabled = false\n",
+            Variant::TceNoReg => iql("tce", "none", 0.0),
             Variant::Dara | Variant::DaraPublished => rival("dara", "dara", ""),
             Variant::Bosa | Variant::BosaPublished => rival("bosa", "bosa", ""),
             Variant::Srpo | Variant::SrpoPublished => rival("srpo", "srpo", ""),
             Variant::Igdf | Variant::IgdfPublished => rival("igdf", "igdf", ""),
             Variant::Otdf | Variant::OtdfPublished => rival("otdf", "otdf", beta_reg),
-            Variant::Synther => format!("{}learner.iql.regulariser = \"none\"\n", iql("synther", "none", 0.0)),
+            Variant::Synther => iql("synther", "none", 0.0),
             Variant::Dmc | Variant::DmcPublished => rival("dmc", "dmc", ""),
             Variant::MetaDt => rival("meta-dt", "meta_dt", ""),
             Variant::Td3Bc => rival("td3-bc", "td3_bc", ""),
             Variant::Rebrac => rival("rebrac", "rebrac", ""),
-            Variant::BcRaw => bc("learner.standardise = false\n"),
-            Variant::Bc => bc("learner.standardise = true\n"),
-            Variant::BcTop => bc("learner.standardise = true\nlearner.top = 0.5\n"),
+            Variant::BcRaw => bc(1, "learner.standardise = false\n"),
+            Variant::Bc => bc(1, "learner.standardise = true\n"),
+            Variant::BcTop => bc(1, "learner.standardise = true\nlearner.top = 0.5\n"),
+            Variant::BcEnsemble => bc(5, "learner.standardise = true\n"),
         }
     }
 }

@@ -65,7 +65,7 @@ impl JudgeArgs {
         };
         let policies = self.policies.iter().map(load).collect::<Result<Vec<_>>>()?;
         let config = DynamicsConfig { steps: self.dynamics_steps, ..DynamicsConfig::default() };
-        let judge = Judge::train(&inputs, &config, 0.05, &self.cache, device)?;
+        let judge = Judge::train(&inputs, &config, &self.cache, device)?;
         let lines = self.policies.iter().zip(&policies);
         let lines = lines.map(|(path, policy)| Ok(Line { policy: path.clone(), judged: judge.judge(policy)? }));
         let at = |q: f64| {

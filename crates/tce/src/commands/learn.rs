@@ -10,15 +10,17 @@ use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, p
 use tce_nn::Device;
 
 use crate::actors::Arena;
-use crate::config::Algorithm;
+use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
-use crate::inputs::first_rows;
+use crate::inputs::{Inputs, first_rows};
+use crate::judge::Judge;
 use crate::layers::ConfigArgs;
 use crate::learning::{Learned, MemberData, learn};
 use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
 use crate::processor::Processor;
+use crate::verdict::{Candidate, Verdict, keep, recommend};
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -44,6 +46,12 @@ pub struct Learn {
     /// The first seed.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// The source's rows, to try the policies in learned dynamics of both robots. Without them the target's rows alone are known.
+    #[arg(long, value_name = "FILE")]
+    source: Option<PathBuf>,
+    /// Do not learn a floor from the target rows alone, do not try the policies, and recommend none.
+    #[arg(long)]
+    no_verdict: bool,
     /// Evaluate in this environment at the end: hopper-morph, ...
     #[arg(long, value_parser = parse_environment)]
     env: Option<(Agent, Shift)>,
@@ -60,6 +68,9 @@ struct Report {
     seeds: Vec<u64>,
     #[serde(flatten)]
     learned: Learned,
+    /// The recommendation, and the file `policy.safetensors` with the policy.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    verdict: Option<(PathBuf, Verdict)>,
 }
 
 impl Learn {
@@ -127,7 +138,8 @@ impl Learn {
             row_scores: row_scores.clone(),
             trajectories: vec![target.clone()],
         };
-        let data = seeds.iter().map(member).collect();
+        let data: Vec<_> = seeds.iter().map(member).collect();
+        let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
         tce_base::write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
@@ -139,11 +151,44 @@ impl Learn {
             }
             Ok(())
         })?;
-        let report = Report { policies: files, seeds, learned };
+        let verdict = match self.no_verdict {
+            true => None,
+            false => {
+                let own = Candidate { name: method.name.into(), floor: extra.is_none(), files: files.clone() };
+                let floor = extra.is_some().then(|| floor(alone, &config, &seeds, (&out, &key), device)).transpose()?;
+                let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?.with_target_rows(config.target.rows);
+                let judge = Judge::train(&inputs, &config.dynamics, &out, device)?;
+                let verdict = recommend(&judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
+                Some((keep(&verdict, &out)?, verdict))
+            }
+        };
+        let report = Report { policies: files, seeds, learned, verdict };
         tce_base::write_json(&out.join("summary.json"), &report)?;
         output.print(&report, render);
         Ok(())
     }
+}
+
+/// What the target rows alone are good for: an ensemble of clones per seed, in `floor/`.
+fn floor(
+    data: Vec<MemberData>,
+    config: &Config,
+    seeds: &[u64],
+    (out, key): (&Path, &str),
+    device: &Device,
+) -> Result<Candidate> {
+    let learner = LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..config.learner.clone() };
+    let directory = out.join("floor");
+    let mut files = Vec::new();
+    learn(data, &learner, &config.evaluation, None, (&directory, key), device, |policies| {
+        for (policy, seed) in policies.iter().zip(seeds) {
+            let file = directory.join(format!("policy-seed{seed}.safetensors"));
+            policy.save(&file)?;
+            files.push(file);
+        }
+        Ok(())
+    })?;
+    Ok(Candidate { name: "cloning the target rows".into(), floor: true, files })
 }
 
 /// What a learning of `spec` left in `out`, if it came to its end; None where it is to begin or to go on.
@@ -190,6 +235,10 @@ fn render(report: &Report) -> String {
         if !names.is_empty() {
             text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
         }
+    }
+    if let Some((file, verdict)) = &report.verdict {
+        let doubt = if verdict.sure { "" } else { " The data do not tell for sure." };
+        text += &format!("\n{}{doubt}\nrecommended policy: {}", verdict.reason, file.display());
     }
     text
 }

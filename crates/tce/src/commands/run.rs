@@ -1,18 +1,22 @@
 //! `tce run`.
 
+use std::path::PathBuf;
+
 use clap::Args;
 use serde::Serialize;
 use tce_data::Task;
-use tce_learn::LabelErrors;
+use tce_learn::{DynamicsConfig, LabelErrors};
 use tce_nn::Device;
 
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
 use crate::inputs::{Behaviour, DataArgs, Inputs};
+use crate::judge::Judge;
 use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
 use crate::variant::Variant;
+use crate::verdict::{Candidate, Verdict, keep, recommend};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
@@ -34,6 +38,9 @@ pub struct Run {
     /// alone).
     #[arg(long)]
     no_floors: bool,
+    /// Do not try the policies in learned dynamics, and recommend none.
+    #[arg(long)]
+    no_verdict: bool,
     /// Another learner for the methods, not for the floors (`tce learn --list`).
     #[arg(long, value_enum)]
     learner: Option<Algorithm>,
@@ -47,6 +54,17 @@ struct Report {
     source: Option<Behaviour>,
     target: Behaviour,
     rows: Vec<Row>,
+    /// The recommended policy; None where `--no-verdict` was said.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    verdict: Option<Kept>,
+}
+
+/// A verdict and where its policy lies.
+#[derive(Serialize)]
+struct Kept {
+    file: PathBuf,
+    #[serde(flatten)]
+    verdict: Verdict,
 }
 
 #[derive(Serialize)]
@@ -92,9 +110,28 @@ impl Run {
             let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, device)?;
             rows.push(Row { title: variant.row_title(config), variant, floor, summary });
         }
+        let verdict = match self.no_verdict {
+            true => None,
+            false => Some(self.verdict(&inputs, &rows, &configs[0].dynamics, device)?),
+        };
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
-        output.print(&Report { task: self.task, source, target, rows }, render);
+        output.print(&Report { task: self.task, source, target, rows, verdict }, render);
         Ok(())
+    }
+}
+
+impl Run {
+    /// Recommends one of the policies of `rows`, and puts it beside the runs.
+    fn verdict(&self, inputs: &Inputs, rows: &[Row], dynamics: &DynamicsConfig, device: &Device) -> Result<Kept> {
+        let candidate = |row: &Row| Candidate {
+            name: row.title.clone(),
+            floor: row.floor,
+            files: row.summary.policies(),
+        };
+        let judge = Judge::train(inputs, dynamics, &self.data.out, device)?;
+        let verdict = recommend(&judge, &rows.iter().map(candidate).collect::<Vec<_>>())?;
+        let file = keep(&verdict, &self.data.out.join(self.task.directory()))?;
+        Ok(Kept { file, verdict })
     }
 }
 
@@ -156,6 +193,10 @@ fn render(report: &Report) -> String {
             ["generated", "sampled", "filtered out", "actions clipped", "terminal", "action RMSE", "reward RMSE"];
         text += &table(&header, generated);
         text += "\n";
+    }
+    if let Some(Kept { file, verdict }) = &report.verdict {
+        let doubt = if verdict.sure { "" } else { " The data do not tell for sure." };
+        text += &format!("{}{doubt}\nrecommended policy: {}\n", verdict.reason, file.display());
     }
     for row in &report.rows {
         text += &format!("{}: {}\n", row.title, row.summary.directory.display());

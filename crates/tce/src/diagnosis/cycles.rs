@@ -127,7 +127,7 @@ pub fn cycles(
     device: &Device,
     mut said: impl FnMut(&AtCycle),
 ) -> Result<Cycles> {
-    let (mut generator, stage, trained) = Generator::train(inputs, &config.generator, &[seed], root, device)?;
+    let (mut generator, stage, trained) = Generator::train(inputs, config, &[seed], root, device)?;
     let (models, ..) = label_models(inputs, &config.labels, &[seed], root, device)?;
     let target = &inputs.target.rows;
     let streams = Streams::new(seed).child("diagnosis/cycles");
@@ -147,7 +147,9 @@ pub fn cycles(
         device,
         step: step.clone(),
     };
-    let training: BTreeMap<u64, f64> = recorded(&stage.file("metrics.jsonl"), "transition", 0, "training_loss")?;
+    let figure = |name: &str| recorded(&stage.file("metrics.jsonl"), "transition", 0, name);
+    let (training, held_out): (BTreeMap<u64, f64>, BTreeMap<u64, f64>) =
+        (figure("training_loss")?, figure("held_out_loss")?);
     let mut networks = Vec::new();
     let chosen = generator.transition.clone();
     for end in &trained.transition_curve {
@@ -156,7 +158,7 @@ pub fn cycles(
         let found = AtCycle {
             updates: Some(end.step),
             chosen: same(&stage, &file, "transition.safetensors")?,
-            held_out_loss: end.criterion.first().copied().filter(|c| c.is_finite()),
+            held_out_loss: held_out.get(&end.step).copied(),
             training_loss: training.get(&end.step).copied(),
             ..bench.measure(&generator)?
         };

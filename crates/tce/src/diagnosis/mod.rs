@@ -164,7 +164,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     if stage.summary::<serde_json::Value>()?.is_some() {
         return Ok((read(&stage.file(&file))?, stage.directory().to_owned()));
     }
-    let (generator, ..) = Generator::train(inputs, &config.generator, seeds, root, device)?;
+    let (generator, ..) = Generator::train(inputs, config, seeds, root, device)?;
     let (models, _, errors) = label_models(inputs, &config.labels, seeds, root, device)?;
     let finisher = Finisher::new(&generator.units, &models, config, inputs);
     let place = (inputs.agent, inputs.shift);

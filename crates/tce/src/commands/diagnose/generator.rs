@@ -149,7 +149,8 @@ impl GeneratorArgs {
         let mut floors = None;
         for process in processes {
             let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
-            let (generator, ..) = Generator::train(&inputs, &generator_config, &seeds, &self.data.out, device)?;
+            let varied = crate::config::Config { generator: generator_config.clone(), ..config.clone() };
+            let (generator, ..) = Generator::train(&inputs, &varied, &seeds, &self.data.out, device)?;
             let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
             if floors.is_none() {
                 let units = &generator.units;
