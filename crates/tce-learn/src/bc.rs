@@ -51,7 +51,8 @@ impl BcConfig {
     pub fn check(&self) -> Result<(), LearnError> {
         within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
         if self.ensemble > 1 && self.actor.form != PolicyForm::TanhMean {
-            let (found, remedy) = (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
+            let (found, remedy) =
+                (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
             return Err(LearnError::invalid("ensemble", found, "1, or policies without noise of their own", remedy));
         }
         Ok(())

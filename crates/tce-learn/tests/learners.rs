@@ -51,7 +51,8 @@ fn linear_data() -> Arc<Transitions> {
 fn cloning_learns_a_linear_policy() {
     let data = linear_data();
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 64).unwrap();
-    let config = BcConfig { actor: ActorConfig { hidden: vec![32, 32], lr: 3e-3, ..ActorConfig::default() } };
+    let actor = ActorConfig { hidden: vec![32, 32], lr: 3e-3, ..ActorConfig::default() };
+    let config = BcConfig { actor, ensemble: 1 };
     let mut bc = Bc::new(&buffer, &config, 1500, &cpu()).unwrap();
     let report = run(&mut bc, &buffer, 1500);
     assert_eq!(report.step, 1500);

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target, UntilDone};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError, MetaDtConfig, Mode,
-    OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError,
+    MetaDtConfig, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -175,7 +175,7 @@ impl UntilDoneConfig {
 pub struct FilterConfig {
     pub enabled: bool,
     #[serde(default, skip_serializing_if = "FilterKind::is_zscore")]
-    pub kind: FilterKind,
+    pub by: FilterKind,
     pub z_threshold: f64,
     /// In runs that were done before there was this key the z-score decides.
     #[serde(default = "FilterConfig::default_margin", skip_serializing_if = "FilterConfig::is_default_margin")]
@@ -185,7 +185,7 @@ pub struct FilterConfig {
 impl FilterConfig {
     /// Whether learned dynamics tell which rows stay.
     pub fn by_dynamics(&self) -> bool {
-        self.enabled && self.kind == FilterKind::Consistency
+        self.enabled && self.by == FilterKind::Consistency
     }
 
     fn default_margin() -> f64 {

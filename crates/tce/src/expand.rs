@@ -113,7 +113,7 @@ impl<'a> Finisher<'a> {
             .zip(successors.chunks_exact(d))
             .map(|(s, s2)| s.iter().chain(s2).all(|v| v.is_finite()));
         let mut keep: Vec<bool> = finite.collect();
-        if self.filter.enabled && self.filter.kind == FilterKind::Zscore {
+        if self.filter.enabled && self.filter.by == FilterKind::Zscore {
             let (states, successors) = (choose(states, d, &keep), choose(successors, d, &keep));
             let pairs = Rows::join(&[(&states, d), (&successors, d)]);
             let inliers = zscore_keep(&pairs, self.filter.z_threshold);
@@ -153,7 +153,7 @@ impl<'a> Finisher<'a> {
 
 /// Of `rows` generated rows none is left.
 pub(crate) fn everything_rejected(rows: usize, filter: &FilterConfig) -> Error {
-    let threshold = match filter.kind {
+    let threshold = match filter.by {
         FilterKind::Zscore => format!("z_threshold = {}", filter.z_threshold),
         FilterKind::Consistency => format!("margin = {}", filter.margin),
     };
@@ -250,14 +250,8 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
             let target = &*inputs.imitated(&config.target);
             let support = config.generator.support.then(|| support(inputs));
             let kept = Chunks { directory: attempt.directory(), key: attempt.key() };
-            let (states, successors) = generator.sample_pairs(
-                rows,
-                &config.generator,
-                &members,
-                target,
-                support.as_ref(),
-                Some(kept),
-            )?;
+            let (states, successors) =
+                generator.sample_pairs(rows, &config.generator, &members, target, support.as_ref(), Some(kept))?;
             let finisher = Finisher::new(&generator.units, &models, config, inputs);
             let per_member = rows * generator.units.live.len();
             let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();

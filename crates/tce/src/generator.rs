@@ -120,7 +120,8 @@ impl Generator {
         }
         let started = std::time::Instant::now();
         let attempt = stage.attempt()?;
-        let (generator, mut trained) = Self::train_now(inputs, config, judge.as_ref().map(|j| &j.0), seeds, device, &attempt)?;
+        let (generator, mut trained) =
+            Self::train_now(inputs, config, judge.as_ref().map(|j| &j.0), seeds, device, &attempt)?;
         trained.seconds = started.elapsed().as_secs_f64();
         generator.state.save(&attempt.file(files[0]))?;
         generator.transition.save(&attempt.file(files[1]))?;
@@ -341,12 +342,22 @@ fn implied_errors(
     let d = units.live.len();
     let states = units.take(&rows.observations).repeat(PROBE_DRAWS);
     let streams: Vec<_> = members.iter().map(|m| m.child("until done")).collect();
-    let training = || units.output.apply(&units.target.encode(&units.take(&target.observations), &units.take(&target.next_observations)));
+    let training = || {
+        units
+            .output
+            .apply(&units.target.encode(&units.take(&target.observations), &units.take(&target.next_observations)))
+    };
     let n = states.len() / d;
     let start = start_rows(model.process(), training, d, n, &streams, "successor");
     let condition = units.state.apply(&states);
-    let request =
-        Request { name: "successor", rows: n, condition: &condition, guidance: None, start: start.as_deref(), kept: None };
+    let request = Request {
+        name: "successor",
+        rows: n,
+        condition: &condition,
+        guidance: None,
+        start: start.as_deref(),
+        kept: None,
+    };
     let mut out = model.sample(request, sampler, &streams, None)?;
     units.output.invert_in_place(&mut out);
     let (whole, own) = (rows.observations.repeat(PROBE_DRAWS), rows.actions.repeat(PROBE_DRAWS));

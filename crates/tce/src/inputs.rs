@@ -6,9 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use tce_base::sha256_file;
 use tce_data::{
-    Agent, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions, choose_trajectories,
-    Choice, ensure_same_agent,
-    infer_agents, load, reference_scores,
+    Agent, Choice, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions,
+    choose_trajectories, ensure_same_agent, infer_agents, load, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
 

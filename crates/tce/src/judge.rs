@@ -69,12 +69,7 @@ pub struct Judged {
 
 impl Judge {
     /// Trains the ensemble on the target's and, if there are any, the source's rows, or takes it from its stage.
-    pub fn train(
-        inputs: &Inputs,
-        config: &DynamicsConfig,
-        root: &Path,
-        device: &Device,
-    ) -> Result<Self> {
+    pub fn train(inputs: &Inputs, config: &DynamicsConfig, root: &Path, device: &Device) -> Result<Self> {
         #[derive(Serialize)]
         struct Spec<'a> {
             inputs: InputSpec,

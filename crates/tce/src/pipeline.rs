@@ -91,9 +91,7 @@ impl Config {
     pub fn needs_source(&self) -> bool {
         let generating = match self.mixture.generated {
             GeneratedRows::None | GeneratedRows::Synther => false,
-            GeneratedRows::Tce => {
-                self.generator.source_states || self.generator.rows == 0 || self.filter.by_dynamics()
-            }
+            GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0 || self.filter.by_dynamics(),
             GeneratedRows::Dmc => true,
         };
         generating || self.mixture.source != SourceRows::None || self.learner.algorithm == Algorithm::Dmc

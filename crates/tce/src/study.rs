@@ -376,6 +376,6 @@ mod tests {
         let some = [(Variant::TceOg, ""), (Variant::Bc, "y0.1"), (Variant::BcRaw, "")];
         let methods = in_order(some.map(|(variant, label)| method(variant, label, None)).to_vec());
         let ids: Vec<&str> = methods.iter().map(|m| m.id.as_str()).collect();
-        assert_eq!(ids, ["bc-raw", "bc y0.1", "bc-top", "target-only", "tce-og"]);
+        assert_eq!(ids, ["bc-raw", "bc y0.1", "bc-top", "target-only", "bc-ensemble", "tce-og"]);
     }
 }

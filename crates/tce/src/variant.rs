@@ -168,9 +168,7 @@ impl Variant {
             Variant::TceOg => rows("tce", "none", 0.0),
             Variant::TceNn => rows("tce", "nearest", lambda),
             Variant::TceOt => rows("tce", "transport", lambda),
-            Variant::SimpleAug => {
-                rows("tce", "none", 0.0) + "generator.y_max = 0.0\ngenerator.source_states = false\n"
-            }
+            Variant::SimpleAug => rows("tce", "none", 0.0) + "generator.y_max = 0.0\ngenerator.source_states = false\n",
             Variant::TargetOnly => iql("none", "none", 0.0) + "learner.standardise = true\n",
             Variant::TargetSource => iql("none", "all", 1.0),
             Variant::IqlSwt => iql("none", "relabelled", 1.0),

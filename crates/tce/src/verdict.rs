@@ -82,14 +82,20 @@ fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
     [mean, std / (differences.len().max(1) as f64).sqrt()]
 }
 
-/// Tries all candidates and recommends one.
+/// Tries all candidates and recommends one. The learned dynamics are asked for only where there is a choice.
 ///
 /// # Errors
-/// If there is no candidate, or a policy cannot be read.
-pub fn recommend(judge: &Judge, candidates: &[Candidate]) -> Result<Verdict> {
-    let try_all = |c: &Candidate| -> Result<Vec<Judged>> {
-        c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect()
-    };
+/// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
+pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]) -> Result<Verdict> {
+    if let [Candidate { name, files, .. }] = candidates
+        && let [policy] = &files[..]
+    {
+        let reason = format!("{name} is the only policy there is.");
+        return Ok(Verdict { method: name.clone(), policy: policy.clone(), sure: true, reason, tried: Vec::new() });
+    }
+    let judge = judge()?;
+    let try_all =
+        |c: &Candidate| -> Result<Vec<Judged>> { c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect() };
     let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
     decide(candidates, &judged)
 }
@@ -109,13 +115,20 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
     let gap = rival.map(|k| difference(&returns[chosen], &returns[k]));
     let name = |k: usize| &candidates[k].name;
     let reason = match (rival, gap) {
-        (Some(k), Some([by, error])) if chosen != standard => format!(
-            "{} is recommended: tried in learned dynamics it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
-            name(chosen), mean(chosen), name(standard), mean(standard),
-        ) + if k == standard { "" } else { " The next best is no floor." },
+        (Some(k), Some([by, error])) if chosen != standard => {
+            format!(
+                "{} is recommended: tried in learned dynamics it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
+                name(chosen),
+                mean(chosen),
+                name(standard),
+                mean(standard),
+            ) + if k == standard { "" } else { " The next best is no floor." }
+        }
         (Some(k), Some([by, error])) => format!(
             "{} is recommended: tried in learned dynamics no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
-            name(chosen), if by >= 0.0 { "it is ahead by" } else { "it is behind by" }, name(k),
+            name(chosen),
+            if by >= 0.0 { "it is ahead by" } else { "it is behind by" },
+            name(k),
         ),
         _ => format!("{} is the only policy.", name(chosen)),
     };
@@ -144,7 +157,9 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
 pub fn keep(verdict: &Verdict, directory: &Path) -> Result<PathBuf> {
     let place = directory.join(FILE);
     Policy::load(&verdict.policy)?.save(&place)?;
-    tce_base::write_json(&directory.join("verdict.json"), verdict)?;
+    // Relative, so that the folder can be moved and two copies of a run have the same bytes.
+    let policy = verdict.policy.strip_prefix(directory).unwrap_or(&verdict.policy).to_owned();
+    tce_base::write_json(&directory.join("verdict.json"), &Verdict { policy, ..verdict.clone() })?;
     Ok(place)
 }
 

@@ -237,7 +237,7 @@ fn a_filter_that_rejects_everything_is_told() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let files = ["diagnose", "--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-    let args = [&files[..], FEW, TINY, &["--set", "filter.z_threshold=0.1"]].concat();
+    let args = [&files[..], FEW, TINY, &["--set", "filter.enabled=true", "--set", "filter.z_threshold=0.1"]].concat();
     let output = tce(dir.path(), &args);
     assert_eq!(output.status.code(), Some(1), "{}", message(&output));
     assert!(message(&output).contains("the filter rejected all 200 generated rows"), "{}", message(&output));

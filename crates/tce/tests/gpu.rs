@@ -87,7 +87,8 @@ fn a_learning_has_the_cpus_figures() {
     let dir = tempfile::tempdir().unwrap();
     common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
     let [a, b] = ["vulkan", "cpu"].map(|device| {
-        let mut args = vec!["--device", device, "learn", "--target", "target.hdf5", "--extra", "source.hdf5"];
+        let mut args =
+            vec!["--device", device, "learn", "--no-verdict", "--target", "target.hdf5", "--extra", "source.hdf5"];
         args.extend(["--learner", "otdf", "--seeds", "2", "--out", device]);
         args.extend(["--set=learner.steps=20", "--set=learner.batch=32", "--set=learner.behaviour.cvae.steps=20"]);
         let output = common::tce(dir.path(), &args);

@@ -27,6 +27,7 @@ const SMALL: &[&str] = &[
     "--set=learner.batch=32",
     "--set=evaluation.episodes=2",
     "--set=evaluation.every=150",
+    "--set=dynamics.steps=20",
 ];
 
 /// The program at work, with a checkpoint at every opportunity.
@@ -280,8 +281,16 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
     common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
     let args = |out: &'static str| {
         let call = ["learn", "--target", "target.hdf5", "--extra", "source.hdf5", "--algorithm", "iql", "--out", out];
-        [&call[..], &["--set=learner.steps=600", "--set=learner.batch=32", "--set=learner.iql.regulariser=none"]]
-            .concat()
+        [
+            &call[..],
+            &[
+                "--set=learner.steps=600",
+                "--set=learner.batch=32",
+                "--set=learner.iql.regulariser=none",
+                "--set=dynamics.steps=20",
+            ],
+        ]
+        .concat()
     };
     assert!(start(dir.path(), &args("whole")).wait().unwrap().success());
     let mut rng = Streams::new(3).stream("kill");

@@ -29,7 +29,7 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
     let (first, again, two) = (run("one", "1"), run("again", "1"), run("two", "2"));
     let scores =
         |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
-    assert_eq!(scores(&first).len(), 6, "four floors and two variants");
+    assert_eq!(scores(&first).len(), 7, "five floors and two variants");
     assert_eq!(scores(&first), scores(&again));
     assert_eq!(scores(&first), scores(&two));
     let [a, b, c] = ["one", "again", "two"].map(|o| results(&dir.path().join(o)));
@@ -71,7 +71,7 @@ fn every_variant_runs_and_leaves_its_specification() {
     args.extend(TINY);
     let report = tce_json(dir.path(), &args);
     let rows = report["rows"].as_array().unwrap();
-    assert_eq!(rows.len(), 10);
+    assert_eq!(rows.len(), 11);
     for row in rows {
         assert!(row["scores"][0].is_number(), "{row}");
         let directory = dir.path().join(row["directory"].as_str().unwrap());
@@ -221,7 +221,7 @@ fn rivals_of_whole_transitions_run() {
     let mut kinds: Vec<String> =
         stages.map(|e| e.file_name().to_string_lossy().split('-').next().unwrap().to_owned()).collect();
     kinds.sort();
-    assert_eq!(kinds, ["generated", "generated", "joint", "joint", "source"]);
+    assert_eq!(kinds, ["dynamics", "generated", "generated", "joint", "joint", "source"]);
     let spec = fs::read_to_string(file(synther, "spec.json")).unwrap();
     assert!(spec.contains("\"source\": null"), "{spec}");
 
@@ -292,6 +292,12 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     args.extend(&TINY[10..]);
     let learned = tce_json(dir.path(), &args);
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
+    // The recommended policy is one of those that were tried: of the learner's, or of the floor.
+    let verdict = &learned["verdict"][1];
+    assert_eq!(verdict["tried"].as_array().unwrap().len(), 2, "{verdict}");
+    let recommended = fs::read(dir.path().join("policy/policy.safetensors")).unwrap();
+    assert!(recommended == fs::read(dir.path().join(verdict["policy"].as_str().unwrap())).unwrap());
+    assert!(verdict["reason"].as_str().unwrap().contains("is recommended"), "{verdict}");
 
     let policy = "policy/policy-seed1.safetensors";
     let evaluated =
@@ -324,6 +330,7 @@ fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
         args.extend(["--env", "hopper-morph", "--seeds", "2", "--out", out, "--threads", threads]);
         args.extend(["--set", "learner.steps=20", "--set", "learner.meta_dt.world_model.steps=10"]);
         args.extend(["--set", "learner.meta_dt.embed=16", "--set", "evaluation.episodes=2"]);
+        args.extend(["--set", "dynamics.steps=20"]);
         tce_json(dir.path(), &args)
     };
     let learned = learn("one", "1");
@@ -342,6 +349,41 @@ fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
     let collect =
         ["collect", "--env", "hopper-morph", "--actor", policy, "--rows", "200", "--lanes", "4", "--out", "c.hdf5"];
     assert_eq!(tce_json(dir.path(), &collect)["content"]["rows"], 200);
+}
+
+/// Networks that are trained until they are done, rows filtered by learned dynamics, the better trajectories imitated: all that a
+/// default run does and the tiny settings above leave out.
+#[test]
+fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Walker2d, Shift::Morph);
+    let run = |threads: &str, out: &str| {
+        let mut args = vec!["run", "walker2d-morph:medium->expert", "--no-floors", "--out", out, "--threads", threads];
+        args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+        args.extend(TINY);
+        args.extend(["--set", "generator.state_steps=\"auto\"", "--set", "generator.transition_steps=\"auto\""]);
+        args.extend(["--set", "generator.until_done={first=20,state_limit=60,transition_limit=140,gain=-100.0}"]);
+        args.extend(["--set", "filter.enabled=true", "--set", "filter.by=consistency", "--set", "filter.margin=1000"]);
+        args.extend(["--seeds", "2"]);
+        tce_json(dir.path(), &args)
+    };
+    let (one, two) = (run("1", "one"), run("2", "two"));
+    assert_eq!(one["rows"][0]["scores"], two["rows"][0]["scores"], "the number of threads decides nothing");
+    let policies = ["one", "two"]
+        .map(|out| fs::read(dir.path().join(out).join("walker2d-morph_medium-to-expert/policy.safetensors")).unwrap());
+    assert!(policies[0] == policies[1] && one["verdict"]["tried"].as_array().unwrap().len() == 1);
+    let stages = common::files(&dir.path().join("one/stages"));
+    let cycles = |name: &str| {
+        let names = stages.iter().filter_map(|p| p.file_name()?.to_str());
+        let mut steps: Vec<u64> =
+            names.filter_map(|n| n.strip_prefix(name)?.strip_suffix(".safetensors")?.parse().ok()).collect();
+        steps.sort_unstable();
+        steps
+    };
+    assert_eq!((cycles("state-"), cycles("transition-")), (vec![20, 60], vec![20, 60, 140]));
+    let metrics = stages.iter().find(|p| p.ends_with("metrics.jsonl") && p.to_string_lossy().contains("networks-"));
+    let metrics = fs::read_to_string(metrics.unwrap()).unwrap();
+    assert!(metrics.contains("implied_action_error") && metrics.contains("held_out_loss"), "{metrics}");
 }
 
 /// An interrupted run keeps the stages it finished and takes them up when it is called again.

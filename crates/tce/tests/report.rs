@@ -68,7 +68,7 @@ fn a_sweep_becomes_a_page() {
     assert!(message(&empty).contains("found no finished run, expected at least one"), "{}", message(&empty));
 
     let records = fill(&sweep, &manifest);
-    assert_eq!(records.len(), 3 * 5 * 2);
+    assert_eq!(records.len(), 3 * 6 * 2);
     let report = tce_json(dir.path(), &["report", "s", "--resamples", "200"]);
     assert_eq!(report["files"], json!(["s/report.html", "s/report.md", "s/report.tex"]));
     assert_eq!(report["comparison"]["tasks"].as_array().unwrap().len(), 3);

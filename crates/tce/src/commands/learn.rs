@@ -156,9 +156,11 @@ impl Learn {
             false => {
                 let own = Candidate { name: method.name.into(), floor: extra.is_none(), files: files.clone() };
                 let floor = extra.is_some().then(|| floor(alone, &config, &seeds, (&out, &key), device)).transpose()?;
-                let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?.with_target_rows(config.target.rows);
-                let judge = Judge::train(&inputs, &config.dynamics, &out, device)?;
-                let verdict = recommend(&judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
+                let judge = || {
+                    let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?;
+                    Judge::train(&inputs.with_target_rows(config.target.rows), &config.dynamics, &out, device)
+                };
+                let verdict = recommend(judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
                 Some((keep(&verdict, &out)?, verdict))
             }
         };

@@ -123,13 +123,10 @@ impl Run {
 impl Run {
     /// Recommends one of the policies of `rows`, and puts it beside the runs.
     fn verdict(&self, inputs: &Inputs, rows: &[Row], dynamics: &DynamicsConfig, device: &Device) -> Result<Kept> {
-        let candidate = |row: &Row| Candidate {
-            name: row.title.clone(),
-            floor: row.floor,
-            files: row.summary.policies(),
-        };
-        let judge = Judge::train(inputs, dynamics, &self.data.out, device)?;
-        let verdict = recommend(&judge, &rows.iter().map(candidate).collect::<Vec<_>>())?;
+        let candidate =
+            |row: &Row| Candidate { name: row.title.clone(), floor: row.floor, files: row.summary.policies() };
+        let judge = || Judge::train(inputs, dynamics, &self.data.out, device);
+        let verdict = recommend(judge, &rows.iter().map(candidate).collect::<Vec<_>>())?;
         let file = keep(&verdict, &self.data.out.join(self.task.directory()))?;
         Ok(Kept { file, verdict })
     }

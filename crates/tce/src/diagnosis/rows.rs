@@ -129,7 +129,8 @@ mod tests {
             simulated: None,
             lost,
         };
-        let filter = FilterConfig { enabled: true, z_threshold: 3.0 };
+        let filter =
+            FilterConfig { enabled: true, by: crate::config::FilterKind::Zscore, z_threshold: 3.0, margin: 2.0 };
         let told = |b: Batch| b.ensure_kept(&filter).map_err(|e| e.to_string());
         assert!(told(batch(vec![], 5)).unwrap_err().contains("none of 5 generated rows is made of finite numbers"));
         assert!(told(batch(vec![false; 3], 1)).unwrap_err().contains("the filter rejected all 4 generated rows"));

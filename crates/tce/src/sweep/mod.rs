@@ -523,7 +523,7 @@ mod tests {
     fn runs_share_what_they_need() {
         let manifest = plan(TWO).unwrap();
         let count = |kind| manifest.entries.iter().filter(|e| e.kind == kind).count();
-        assert_eq!(count(Kind::Run), 2 * (3 + 4) * 2);
+        assert_eq!(count(Kind::Run), 2 * (3 + 5) * 2);
         // Two methods of one seed learn from the same generated rows.
         assert_eq!(count(Kind::Expand), 2 * 2);
         assert_eq!((count(Kind::Source), count(Kind::Target)), (1, 2));

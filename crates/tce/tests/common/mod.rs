@@ -130,4 +130,6 @@ pub const TINY: &[&str] = &[
     "joint.sampler.steps=4",
     "--set",
     "joint.width=32",
+    "--set",
+    "dynamics.steps=20",
 ];

@@ -9,6 +9,7 @@ use serde_json::Value;
 /// Settings under which a piece of work takes a second or two.
 pub const SETS: &[&str] = &[
     "source.rows=1500",
+    "dynamics.steps=20",
     "generator.state_steps=100",
     "generator.transition_steps=100",
     "generator.batch=32",
