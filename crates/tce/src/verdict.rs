@@ -150,17 +150,35 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
     })
 }
 
+/// A verdict and the file that its policy was put into.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Kept {
+    /// The file.
+    pub file: PathBuf,
+    /// The verdict.
+    #[serde(flatten)]
+    pub verdict: Verdict,
+}
+
+impl Kept {
+    /// What a person reads.
+    pub fn sentences(&self) -> String {
+        let doubt = if self.verdict.sure { "" } else { " The data do not tell for sure." };
+        format!("{}{doubt}\nrecommended policy: {}", self.verdict.reason, self.file.display())
+    }
+}
+
 /// Puts the recommended policy into `directory`, whole or not at all, and the verdict beside it.
 ///
 /// # Errors
 /// If a file cannot be read or written.
-pub fn keep(verdict: &Verdict, directory: &Path) -> Result<PathBuf> {
+pub fn keep(verdict: Verdict, directory: &Path) -> Result<Kept> {
     let place = directory.join(FILE);
     Policy::load(&verdict.policy)?.save(&place)?;
     // Relative, so that the folder can be moved and two copies of a run have the same bytes.
     let policy = verdict.policy.strip_prefix(directory).unwrap_or(&verdict.policy).to_owned();
     tce_base::write_json(&directory.join("verdict.json"), &Verdict { policy, ..verdict.clone() })?;
-    Ok(place)
+    Ok(Kept { file: place, verdict })
 }
 
 #[cfg(test)]

@@ -88,7 +88,12 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert_eq!(rows_of("iql-swt"), 1500);
     assert_eq!(rows_of("bc-raw"), 0);
     assert_eq!(rows_of("tce-no-filter"), 600);
-    assert!(rows_of("tce-no-reg") < 600, "the filter rejects something");
+    assert_eq!(rows_of("tce-no-reg"), 600, "no filter by default");
+    let at = args.iter().position(|a| *a == variants).unwrap();
+    args[at] = "tce-no-reg";
+    args.extend(["--no-floors", "--set", "filter.enabled=true"]);
+    let filtered = tce_json(dir.path(), &args)["rows"][0]["extra_rows"].as_u64().unwrap();
+    assert!(filtered < 600 && filtered > 0, "the filter rejects something, not all: {filtered}");
 }
 
 /// Every rival and both of its modes, beside TCE's own rows under another learner.
@@ -293,11 +298,18 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     let learned = tce_json(dir.path(), &args);
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
     // The recommended policy is one of those that were tried: of the learner's, or of the floor.
-    let verdict = &learned["verdict"][1];
+    let verdict = &learned["verdict"];
     assert_eq!(verdict["tried"].as_array().unwrap().len(), 2, "{verdict}");
     let recommended = fs::read(dir.path().join("policy/policy.safetensors")).unwrap();
     assert!(recommended == fs::read(dir.path().join(verdict["policy"].as_str().unwrap())).unwrap());
     assert!(verdict["reason"].as_str().unwrap().contains("is recommended"), "{verdict}");
+    let both = ["policy/policy-seed0.safetensors", "policy/policy.safetensors"];
+    let judge = ["--source", "source.hdf5", "--target", "target.hdf5", "--dynamics-steps", "20"];
+    let judged = tce_json(dir.path(), &[&["judge"][..], &both, &judge].concat());
+    assert!(judged["policies"].as_array().unwrap().len() == 2 && judged["held_out"][0].is_number(), "{judged}");
+    assert_eq!(judged["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
+    let foreign = tce(dir.path(), &[&["judge", "zoo.safetensors"][..], &judge].concat());
+    assert_eq!(foreign.status.code(), Some(1), "no such policy");
 
     let policy = "policy/policy-seed1.safetensors";
     let evaluated =

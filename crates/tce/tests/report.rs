@@ -89,9 +89,9 @@ fn a_sweep_becomes_a_page() {
     let partial = tce(dir.path(), &["report", "s", "--resamples", "200"]);
     assert!(partial.status.success());
     let text = String::from_utf8_lossy(&partial.stdout).into_owned();
-    assert!(text.contains("warning: Partial results: 2 of 30 runs"), "{text}");
+    assert!(text.contains("warning: Partial results: 2 of 36 runs"), "{text}");
     let page = fs::read_to_string(sweep.join("report.html")).unwrap();
-    assert!(page.contains("Partial results: 2 of 30") && page.contains("corrupt: ") && page.contains("not done"));
+    assert!(page.contains("Partial results: 2 of 36") && page.contains("corrupt: ") && page.contains("not done"));
     fs::write(&changed, whole).unwrap();
 
     // A record that says something else than the run is no result.

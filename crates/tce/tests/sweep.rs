@@ -155,7 +155,7 @@ fn a_failure_is_kept_and_the_rest_is_done() {
     let file = describe(dir.path(), "s", 1);
     let text = fs::read_to_string(dir.path().join(&file)).unwrap();
     // A threshold that rejects every generated row fails both methods that need them.
-    let broken = text.replace("set = [", "set = [\"filter.z_threshold=0.1\", ");
+    let broken = text.replace("set = [", "set = [\"filter.enabled=true\", \"filter.z_threshold=0.1\", ");
     fs::write(dir.path().join(&file), broken).unwrap();
     assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
     let launched = tce(dir.path(), &["sweep", "launch", "s", "--workers", "2", "--retries", "0"]);

@@ -20,7 +20,7 @@ use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::seeds;
 use crate::processor::Processor;
-use crate::verdict::{Candidate, Verdict, keep, recommend};
+use crate::verdict::{Candidate, Kept, keep, recommend};
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -70,7 +70,7 @@ struct Report {
     learned: Learned,
     /// The recommendation, and the file `policy.safetensors` with the policy.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    verdict: Option<(PathBuf, Verdict)>,
+    verdict: Option<Kept>,
 }
 
 impl Learn {
@@ -114,11 +114,22 @@ impl Learn {
         if let Some(extra) = &extra {
             ensure_same_agent(extra, &target)?;
         }
+        // Read before anything is computed: a source that does not fit is no surprise after hours.
+        let inputs = match self.no_verdict {
+            true => None,
+            false => {
+                let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?;
+                Some(inputs.with_target_rows(config.target.rows))
+            }
+        };
         let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
             "target": sha256_file(&target_file)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
         });
+        if let Some(source) = &self.source {
+            spec["source"] = sha256_file(source)?.into();
+        }
         Processor::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
@@ -151,17 +162,14 @@ impl Learn {
             }
             Ok(())
         })?;
-        let verdict = match self.no_verdict {
-            true => None,
-            false => {
+        let verdict = match &inputs {
+            None => None,
+            Some(inputs) => {
                 let own = Candidate { name: method.name.into(), floor: extra.is_none(), files: files.clone() };
                 let floor = extra.is_some().then(|| floor(alone, &config, &seeds, (&out, &key), device)).transpose()?;
-                let judge = || {
-                    let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?;
-                    Judge::train(&inputs.with_target_rows(config.target.rows), &config.dynamics, &out, device)
-                };
+                let judge = || Judge::train(inputs, &config.dynamics, &out, device);
                 let verdict = recommend(judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
-                Some((keep(&verdict, &out)?, verdict))
+                Some(keep(verdict, &out)?)
             }
         };
         let report = Report { policies: files, seeds, learned, verdict };
@@ -238,9 +246,9 @@ fn render(report: &Report) -> String {
             text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
         }
     }
-    if let Some((file, verdict)) = &report.verdict {
-        let doubt = if verdict.sure { "" } else { " The data do not tell for sure." };
-        text += &format!("\n{}{doubt}\nrecommended policy: {}", verdict.reason, file.display());
+    if let Some(kept) = &report.verdict {
+        text += "\n";
+        text += &kept.sentences();
     }
     text
 }

@@ -1,7 +1,5 @@
 //! `tce run`.
 
-use std::path::PathBuf;
-
 use clap::Args;
 use serde::Serialize;
 use tce_data::Task;
@@ -16,7 +14,7 @@ use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
 use crate::variant::Variant;
-use crate::verdict::{Candidate, Verdict, keep, recommend};
+use crate::verdict::{Candidate, Kept, keep, recommend};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
@@ -57,14 +55,6 @@ struct Report {
     /// The recommended policy; None where `--no-verdict` was said.
     #[serde(skip_serializing_if = "Option::is_none")]
     verdict: Option<Kept>,
-}
-
-/// A verdict and where its policy lies.
-#[derive(Serialize)]
-struct Kept {
-    file: PathBuf,
-    #[serde(flatten)]
-    verdict: Verdict,
 }
 
 #[derive(Serialize)]
@@ -127,8 +117,7 @@ impl Run {
             |row: &Row| Candidate { name: row.title.clone(), floor: row.floor, files: row.summary.policies() };
         let judge = || Judge::train(inputs, dynamics, &self.data.out, device);
         let verdict = recommend(judge, &rows.iter().map(candidate).collect::<Vec<_>>())?;
-        let file = keep(&verdict, &self.data.out.join(self.task.directory()))?;
-        Ok(Kept { file, verdict })
+        keep(verdict, &self.data.out.join(self.task.directory()))
     }
 }
 
@@ -191,9 +180,9 @@ fn render(report: &Report) -> String {
         text += &table(&header, generated);
         text += "\n";
     }
-    if let Some(Kept { file, verdict }) = &report.verdict {
-        let doubt = if verdict.sure { "" } else { " The data do not tell for sure." };
-        text += &format!("{}{doubt}\nrecommended policy: {}\n", verdict.reason, file.display());
+    if let Some(kept) = &report.verdict {
+        text += &kept.sentences();
+        text += "\n";
     }
     for row in &report.rows {
         text += &format!("{}: {}\n", row.title, row.summary.directory.display());
