@@ -29,7 +29,8 @@ const BEST: &str = "best/";
 /// Key of the cycles' ends in the metadata of a training's state.
 const ENDS: &str = "until_done";
 
-/// When a training is done; see the [module](self).
+/// When a training is done: after a cosine cycle that lowers the criterion by less than `gain`, or at the `limit`. Cycle k takes
+/// `first` · 2ᵏ steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct UntilDone {
