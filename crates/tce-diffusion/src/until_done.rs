@@ -118,10 +118,7 @@ impl Found {
             .map_err(|e| NetworkError::Format { path: path.to_owned(), reason: format!("metadata '{ENDS}': {e}") })?;
         let ends =
             bits.into_iter().map(|(step, c)| CycleEnd { step, criterion: c.into_iter().map(f64::from_bits).collect() });
-        let mut best = NamedParameters::default();
-        let tensors = state.tensors.iter();
-        best.tensors.extend(tensors.filter_map(|(name, t)| Some((name.strip_prefix(BEST)?.to_owned(), t.clone()))));
-        Ok(Self { ends: ends.collect(), best })
+        Ok(Self { ends: ends.collect(), best: state.under(BEST) })
     }
 
     /// The criteria of member `m` so far.

@@ -90,6 +90,11 @@ fn step(actor: &mut Actor, batch: &Minibatch, step: u64) -> Tensor<3> {
     value
 }
 
+/// What the names of policy `k` of an ensemble begin with in a checkpoint.
+fn prefix(k: usize) -> String {
+    if k == 0 { String::new() } else { format!("{k}/") }
+}
+
 impl Learner for Bc {
     fn update(&mut self, batch: &Minibatch, at: u64, meter: &mut Meter) {
         let losses: Vec<_> = self.actors.par_iter_mut().map(|actor| step(actor, batch, at)).collect();
@@ -99,27 +104,17 @@ impl Learner for Bc {
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
         for (k, actor) in self.actors.iter().enumerate() {
+            // The first one's names are those of a policy alone.
             let mut own = NamedParameters::default();
             actor.save(&mut own);
-            let name = |name: String| if k == 0 { name } else { format!("{k}/{name}") };
-            state.tensors.extend(own.tensors.into_iter().map(|(n, t)| (name(n), t)));
-            state.metadata.extend(own.metadata.into_iter().map(|(n, t)| (name(n), t)));
+            state.extend_under(&prefix(k), own);
         }
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         for (k, actor) in self.actors.iter_mut().enumerate() {
-            if k == 0 {
-                actor.load(state, path)?;
-                continue;
-            }
-            let prefix = format!("{k}/");
-            let mut own = NamedParameters::default();
-            let strip = |name: &String| name.strip_prefix(&prefix).map(str::to_owned);
-            own.tensors.extend(state.tensors.iter().filter_map(|(n, t)| Some((strip(n)?, t.clone()))));
-            own.metadata.extend(state.metadata.iter().filter_map(|(n, t)| Some((strip(n)?, t.clone()))));
-            actor.load(&own, path)?;
+            actor.load(&state.under(&prefix(k)), path)?;
         }
         Ok(())
     }

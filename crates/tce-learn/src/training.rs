@@ -411,20 +411,14 @@ impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
     /// Adds the state of this lane, number `k`, to a checkpoint.
     fn keep(&self, k: usize, state: &mut NamedParameters) {
         let own = self.lane.learner.state();
-        state.tensors.extend(own.tensors.into_iter().map(|(name, tensor)| (format!("{k}/{name}"), tensor)));
-        state.metadata.extend(own.metadata.into_iter().map(|(name, value)| (format!("{k}/{name}"), value)));
+        state.extend_under(&format!("{k}/"), own);
         let figures = serde_json::to_string(&(&self.meter, &self.history)).expect("plain data");
         state.metadata.insert(format!("{k}/meter"), figures);
     }
 
     /// Puts back what [`Run::keep`] added.
     fn restore(&mut self, k: usize, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
-        let prefix = format!("{k}/");
-        let mut own = NamedParameters::default();
-        let tensors = state.tensors.iter().filter_map(|(n, t)| Some((n.strip_prefix(&prefix)?.to_owned(), t.clone())));
-        own.tensors.extend(tensors);
-        let metadata = state.metadata.iter();
-        own.metadata.extend(metadata.filter_map(|(n, v)| Some((n.strip_prefix(&prefix)?.to_owned(), v.clone()))));
+        let mut own = state.under(&format!("{k}/"));
         // Until November 2026 there was no history.
         let figures = |text: String| {
             serde_json::from_str(&text).ok().or_else(|| Some((serde_json::from_str(&text).ok()?, Vec::new())))

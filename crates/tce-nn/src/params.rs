@@ -59,6 +59,22 @@ impl NamedParameters {
         module.visit(&mut Collector { path: vec![prefix.to_owned()], out: &mut self.tensors });
     }
 
+    /// Adds all of `own` under names that begin with `prefix`.
+    pub fn extend_under(&mut self, prefix: &str, own: Self) {
+        self.tensors.extend(own.tensors.into_iter().map(|(name, tensor)| (format!("{prefix}{name}"), tensor)));
+        self.metadata.extend(own.metadata.into_iter().map(|(name, text)| (format!("{prefix}{name}"), text)));
+    }
+
+    /// What was added under `prefix`, by its own names.
+    pub fn under(&self, prefix: &str) -> Self {
+        fn own<T: Clone>(prefix: &str, all: &BTreeMap<String, T>) -> BTreeMap<String, T> {
+            all.iter()
+                .filter_map(|(name, value)| Some((name.strip_prefix(prefix)?.to_owned(), value.clone())))
+                .collect()
+        }
+        Self { tensors: own(prefix, &self.tensors), metadata: own(prefix, &self.metadata) }
+    }
+
     /// Member `index` of every tensor, as a population of one.
     pub fn member(&self, index: usize) -> Self {
         let take = |(name, (shape, data)): (&String, &(Vec<usize>, Vec<f32>))| {

@@ -47,7 +47,7 @@ pub struct Trained {
     /// Held-out losses at the ends of q_mix's cycles; empty where its length was given.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub state_curve: Vec<CycleEnd>,
-    /// Held-out losses at the ends of q_tran's cycles; empty where its length was given.
+    /// Errors of the actions that q_tran implies at held-out states, at the ends of its cycles; empty where its length was given.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub transition_curve: Vec<CycleEnd>,
     /// Seconds of training, all members together.
@@ -147,8 +147,7 @@ impl Generator {
         let units = Units::fit(target, source, g.target);
         let d = units.live.len();
         let train = TrainConfig { learning_rate: g.learning_rate, schedule: g.schedule, batch: g.batch, ema: g.ema };
-        let (s, s2) = (units.take(&target.observations), units.take(&target.next_observations));
-        let all_states = units.state.apply(&s);
+        let all_states = units.states(&target.observations);
         // Rows that tell when to stop are seen by neither network.
         let (kept, held_out) = held_out_rows(target.len(), g);
         let pick = |rows: &[f32], of: &[usize]| -> Vec<f32> {
@@ -159,7 +158,7 @@ impl Generator {
         // q_mix: the label says whose state it is (Eq. 5). q_tran: target rows alone. Neither needs the other, so they
         // train side by side where there are two threads.
         let source_states = source.map(|t| units.states(&t.observations)).unwrap_or_default();
-        let all_outputs = units.output.apply(&g.target.encode(&s, &s2));
+        let all_outputs = units.outputs(target);
         let (outputs, held_out_outputs) = (pick(&all_outputs, &kept), pick(&all_outputs, &held_out));
         let state_data = match source {
             Some(_) => ScoreData::labelled(&source_states, &target_states, d, g.balanced)?,
@@ -253,8 +252,7 @@ impl Generator {
 
     /// What q_tran is trained on: standardised outputs of the rows of `target`, `[rows, d]`.
     pub(crate) fn outputs(&self, target: &Transitions) -> Vec<f32> {
-        let (s, s2) = (self.units.take(&target.observations), self.units.take(&target.next_observations));
-        self.units.output.apply(&self.units.target.encode(&s, &s2))
+        self.units.outputs(target)
     }
 
     /// Samples `rows` states per member under ŷ ~ U(0, y_max): live dimensions in the data's units, `[P, rows, d]`.
@@ -342,13 +340,8 @@ fn implied_errors(
     let d = units.live.len();
     let states = units.take(&rows.observations).repeat(PROBE_DRAWS);
     let streams: Vec<_> = members.iter().map(|m| m.child("until done")).collect();
-    let training = || {
-        units
-            .output
-            .apply(&units.target.encode(&units.take(&target.observations), &units.take(&target.next_observations)))
-    };
     let n = states.len() / d;
-    let start = start_rows(model.process(), training, d, n, &streams, "successor");
+    let start = start_rows(model.process(), || units.outputs(target), d, n, &streams, "successor");
     let condition = units.state.apply(&states);
     let request = Request {
         name: "successor",
@@ -444,7 +437,7 @@ pub(crate) struct Ready {
     pub model: ScoreModel,
     /// Last reported loss, per member.
     pub loss: Vec<f32>,
-    /// Held-out losses at the ends of the cycles.
+    /// What decided at the ends of the cycles; empty where the length was given.
     pub curve: Vec<CycleEnd>,
 }
 

@@ -25,6 +25,7 @@ use tce_nn::{Device, NamedParameters};
 use crate::error::{Error, Result};
 use crate::generator::hold_out_runs;
 use crate::inputs::{InputSpec, Inputs};
+use crate::output::mean_std;
 use crate::stage::Stage;
 use crate::units::even_standardizer;
 
@@ -186,13 +187,12 @@ impl Judge {
         }
         let returns = returns.concat();
         let n = returns.len() as f64;
-        let mean = returns.iter().sum::<f64>() / n;
-        let variance = returns.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+        let (mean, std) = mean_std(&returns);
         let mut actions = vec![0.0; t.actions.len()];
         policy.act(&t.observations, None, &mut actions);
         Ok(Judged {
             imagined_return: mean,
-            standard_error: (variance / n).sqrt(),
+            standard_error: std / n.sqrt(),
             survival: steps.concat().iter().sum::<usize>() as f64 / (n * self.limit as f64),
             distance: if visited.is_empty() { f64::INFINITY } else { median(distances(&visited, t)?) / self.spacing },
             action_error: rmse(&actions, &t.actions),

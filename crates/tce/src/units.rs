@@ -77,6 +77,12 @@ impl Units {
         out
     }
 
+    /// What q_tran is trained on: standardised outputs of the rows of `t`, `[rows, d]`.
+    pub fn outputs(&self, t: &Transitions) -> Vec<f32> {
+        let (s, s2) = (self.take(&t.observations), self.take(&t.next_observations));
+        self.output.apply(&self.target.encode(&s, &s2))
+    }
+
     /// Live dimensions of states that respect what the data respect.
     pub fn within(&self, support: &Support, live: &[f32]) -> Vec<f32> {
         let mut whole = self.put_back(live);

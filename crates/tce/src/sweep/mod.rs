@@ -320,7 +320,9 @@ impl Manifest {
                 }
                 GeneratedRows::Tce | GeneratedRows::None => {
                     let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
-                    serde_json::json!([config.generator, config.filter, config.labels, lambda])
+                    let dynamics = config.filter.by_dynamics().then_some(&config.dynamics);
+                    let imitated = config.target.trajectories;
+                    serde_json::json!([config.generator, config.filter, config.labels, lambda, imitated, dynamics])
                 }
             };
             let spec = serde_json::json!([task, data, from_zoo, rows, generated, own, seed]);
