@@ -9,6 +9,12 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tempfile::NamedTempFile;
 
+use crate::owner::Owner;
+
+/// What the names of temporary files begin with; their owner follows.
+const PREFIX: &str = ".tce-";
+const SUFFIX: &str = ".part";
+
 /// A file could not be read or written.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: cannot {action}: {source}", path.display())]
@@ -40,9 +46,10 @@ impl AtomicFile {
     pub fn create(target: &Path) -> Result<Self, FileError> {
         let directory = parent(target);
         fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        sweep(directory);
         let temporary = tempfile::Builder::new()
-            .prefix(".tce-")
-            .suffix(".part")
+            .prefix(&format!("{PREFIX}{}.", Owner::this()))
+            .suffix(SUFFIX)
             .tempfile_in(directory)
             .map_err(|e| FileError::new(target, "create a temporary file beside it", e))?;
         Ok(Self { target: target.to_owned(), temporary })
@@ -60,6 +67,19 @@ impl AtomicFile {
 
     /// Flushes the bytes to disk, gives the file its final name and flushes the directory.
     pub fn commit(self) -> Result<(), FileError> {
+        let Self { target, temporary } = self.complete()?;
+        temporary.persist(&target).map_err(|e| FileError::new(&target, "rename into place", e.error))?;
+        flush_directory(&target)
+    }
+
+    /// As [`Self::commit`], unless the name is taken: of several that want it, the first one gets it. Whether this one did.
+    pub fn commit_first(self) -> Result<bool, FileError> {
+        let Self { target, temporary } = self.complete()?;
+        link_first(temporary.path(), &target)
+    }
+
+    /// Flushes the bytes to disk.
+    fn complete(self) -> Result<Self, FileError> {
         let Self { target, temporary } = self;
         // The content may have been written through another handle (an HDF5 writer opens the path itself), so the
         // file is synced by path.
@@ -73,8 +93,19 @@ impl AtomicFile {
             fs::set_permissions(temporary.path(), fs::Permissions::from_mode(0o644))
                 .map_err(|e| FileError::new(&target, "set the permissions", e))?;
         }
-        temporary.persist(&target).map_err(|e| FileError::new(&target, "rename into place", e.error))?;
-        flush_directory(&target)
+        Ok(Self { target, temporary })
+    }
+}
+
+/// Removes the temporary files that killed processes of this machine left in `directory`. Whatever they were to become is not there,
+/// so whoever needs it comes by here to make it.
+fn sweep(directory: &Path) {
+    for entry in fs::read_dir(directory).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let owned = name.to_str().and_then(|n| n.strip_prefix(PREFIX)?.strip_suffix(SUFFIX));
+        if owned.and_then(|n| Owner::of(Path::new(n))).is_some_and(|owner| owner.dead()) {
+            let _ = fs::remove_file(entry.path());
+        }
     }
 }
 
@@ -155,9 +186,20 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
 
 /// Writes `value` as indented JSON to `path`, whole or not at all.
 pub fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), FileError> {
+    write_atomically(path, &json(path, value)?)
+}
+
+/// As [`write_json`], unless there is such a file: of several that write it, the first one does. Whether this one did.
+pub fn write_json_first<T: Serialize>(path: &Path, value: &T) -> Result<bool, FileError> {
+    let mut file = AtomicFile::create(path)?;
+    file.file().write_all(&json(path, value)?).map_err(|e| FileError::new(path, "write", e))?;
+    file.commit_first()
+}
+
+fn json<T: Serialize>(path: &Path, value: &T) -> Result<Vec<u8>, FileError> {
     let mut bytes = serde_json::to_vec_pretty(value).map_err(|e| FileError::new(path, "serialise", e.into()))?;
     bytes.push(b'\n');
-    write_atomically(path, &bytes)
+    Ok(bytes)
 }
 
 /// The SHA-256 of `bytes` as lower-case hexadecimal.
@@ -209,6 +251,33 @@ mod tests {
         assert_eq!(read_if_there(&name).unwrap().unwrap(), b"first");
         assert!(link_first(&b, &dir.path().join("nowhere/name")).is_err());
         assert!(read_if_there(dir.path()).is_err());
+    }
+
+    #[test]
+    fn what_a_killed_process_left_goes_and_what_a_living_one_writes_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let this = Owner::this().to_string();
+        let (machine_and_process, _) = this.rsplit_once('.').unwrap();
+        // A process cannot have started at 1: whoever had this number is gone.
+        let dead = dir.path().join(format!("{PREFIX}{machine_and_process}.1.Ab12Cd{SUFFIX}"));
+        let elsewhere = dir.path().join(format!("{PREFIX}other-host.7.1.Ab12Cd{SUFFIX}"));
+        let mine = AtomicFile::create(&dir.path().join("slow")).unwrap();
+        for path in [&dead, &elsewhere] {
+            fs::write(path, b"half").unwrap();
+        }
+        write_atomically(&dir.path().join("result"), b"whole").unwrap();
+        assert!(!dead.exists() && elsewhere.exists() && mine.path().exists());
+        mine.commit().unwrap();
+    }
+
+    #[test]
+    fn the_first_of_two_documents_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("done.json");
+        assert!(write_json_first(&target, &1).unwrap());
+        assert!(!write_json_first(&target, &2).unwrap());
+        assert_eq!(fs::read(&target).unwrap(), b"1\n");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -2,14 +2,16 @@
 //! work that shows its progress and can be interrupted.
 
 pub mod files;
+pub mod owner;
 pub mod progress;
 pub mod random;
 pub mod sealed;
 
 pub use files::{
     AtomicFile, FileError, first_damaged, link_first, move_into_place, read_if_there, sha256_file, sha256_hex,
-    write_atomically, write_json,
+    write_atomically, write_json, write_json_first,
 };
+pub use owner::Owner;
 pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
 pub use random::{Rng, Streams};
 pub use sealed::{Sealed, read_sealed, write_sealed};

@@ -5,10 +5,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tce_base::FileError;
+use tce_base::{FileError, Owner};
 
 use crate::error::Result;
-use crate::stage::{ATTEMPTS, Owner};
+use crate::stage::ATTEMPTS;
 
 /// A directory of this process; it goes when this is dropped.
 #[derive(Debug)]

@@ -17,7 +17,7 @@ use std::time::SystemTime;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, link_first, read_if_there, sha256_file, sha256_hex, write_json};
+use tce_base::{FileError, Owner, link_first, read_if_there, sha256_file, sha256_hex, write_json};
 use tce_nn::{Checkpoints, Device};
 
 use crate::PROGRAM;
@@ -296,68 +296,6 @@ pub fn files_of(directory: &Path) -> Result<BTreeMap<String, String>> {
     done.map(|d| d.files).ok_or_else(|| Error::missing(directory, "no done.json: the stage is not finished"))
 }
 
-/// The process that owns an attempt: machine, process and when that started, because numbers of processes come again.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Owner {
-    machine: String,
-    process: u32,
-    started: u64,
-}
-
-impl std::fmt::Display for Owner {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}.{}.{}", self.machine, self.process, self.started)
-    }
-}
-
-impl Owner {
-    /// This process.
-    pub fn this() -> Self {
-        let process = std::process::id();
-        Self { machine: machine(), process, started: started(process).unwrap_or(0) }
-    }
-
-    /// The one in an attempt's name.
-    pub(crate) fn of(attempt: &Path) -> Option<Self> {
-        let name = attempt.file_name()?.to_str()?;
-        let mut parts = name.rsplitn(4, '.');
-        let _count = parts.next()?;
-        let started = parts.next()?.parse().ok()?;
-        let process = parts.next()?.parse().ok()?;
-        Some(Self { machine: parts.next()?.to_owned(), process, started })
-    }
-
-    /// Whether it is certainly gone. Of another machine nothing is certain.
-    pub(crate) fn dead(&self) -> bool {
-        let known = self.started != 0 && self.machine == machine();
-        known && started(self.process) != Some(self.started)
-    }
-}
-
-/// The machine's name, the id of its present boot and the name space of processes: after a restart, and in every container, numbers of
-/// processes begin anew.
-fn machine() -> String {
-    let read = |path: &str| fs::read_to_string(path).unwrap_or_default().trim().to_owned();
-    let name = read("/proc/sys/kernel/hostname").replace(['.', '/'], "-");
-    let boot = read("/proc/sys/kernel/random/boot_id");
-    let space = fs::read_link("/proc/self/ns/pid").unwrap_or_default();
-    let space: String = space.to_string_lossy().chars().filter(char::is_ascii_digit).collect();
-    format!("{name}-{}-{space}", boot.get(..8).unwrap_or("unknown"))
-}
-
-/// When a process of this machine began, in ticks since the boot; none if there is no such process.
-fn started(process: u32) -> Option<u64> {
-    let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The second field is the program's name in brackets, which may hold anything.
-    let rest = &stat[stat.rfind(')')? + 1..];
-    let mut fields = rest.split_whitespace();
-    if fields.next() == Some("Z") {
-        return None;
-    }
-    // The state was the third field; the start is the twenty-second.
-    fields.nth(18)?.parse().ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -427,11 +365,10 @@ mod tests {
             fs::remove_dir_all(attempt.directory()).unwrap();
         }
 
-        let dead = Owner { started: 1, ..Owner::this() };
-        assert!(dead.dead() && !Owner::this().dead());
-        assert!(!Owner { machine: "elsewhere".into(), ..dead.clone() }.dead());
-        let left = s.directory().join(ATTEMPTS).join(format!("{dead}.0"));
-        assert_eq!(Owner::of(&left), Some(dead));
+        // A process cannot have started at 1: whoever had this number is gone.
+        let this = Owner::this().to_string();
+        let (machine_and_process, _) = this.rsplit_once('.').unwrap();
+        let left = s.directory().join(ATTEMPTS).join(format!("{machine_and_process}.1.0"));
         fs::create_dir_all(&left).unwrap();
         fs::write(left.join("note"), b"dead").unwrap();
         let heir = s.attempt().unwrap();

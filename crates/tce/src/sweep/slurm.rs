@@ -12,12 +12,11 @@ use std::process::Command;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
-use tce_base::{sha256_hex, write_atomically};
+use tce_base::{Owner, sha256_hex, write_atomically};
 
 use super::{Kind, Sweep};
 use crate::error::{Error, Result};
 use crate::processor::Processor;
-use crate::stage::Owner;
 
 /// How to submit.
 #[derive(Clone, Debug)]

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, link_first, read_if_there, sha256_file, write_json};
+use tce_base::{FileError, Owner, read_if_there, sha256_file, write_json, write_json_first};
 use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
@@ -19,7 +19,7 @@ use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
 use crate::mixture::distances_stage;
 use crate::pipeline::run;
-use crate::stage::{Owner, files_of};
+use crate::stage::files_of;
 
 /// Time between two signs of life.
 const BEAT: Duration = Duration::from_secs(10);
@@ -232,11 +232,7 @@ impl Sweep {
     /// If that copy came to another result: both are kept.
     pub fn settle(&self, outcome: Outcome) -> Result<Outcome> {
         let path = self.file("done", &format!("{}.json", outcome.id));
-        let own = self.file("done", &format!(".{}.{}.part", outcome.id, Owner::this()));
-        write_json(&own, &outcome)?;
-        let first = link_first(&own, &path);
-        let _ = fs::remove_file(&own);
-        if first? {
+        if write_json_first(&path, &outcome)? {
             return Ok(outcome);
         }
         let bytes = fs::read(&path).map_err(|e| FileError::new(&path, "read", e))?;
