@@ -31,6 +31,8 @@ pub enum Problem {
     Value,
     /// The file announces far more data than its bytes can hold.
     Oversized,
+    /// Right HDF5 in a form that is not read: a compression, another file's data.
+    Unsupported,
 }
 
 /// Why a data set was refused or could not be written.

@@ -49,7 +49,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     // The two large columns are inflated side by side, each through a handle of its own.
     rayon::scope(|s| {
         if file.has("next_observations") {
-            s.spawn(|_| stored = Some(Hdf5::open(path).and_then(|f| f.matrix("next_observations"))));
+            s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix("next_observations"))));
         }
         observed = Some(file.matrix("observations"));
     });
@@ -75,7 +75,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     }
     check_dimensions(&file, &observations, &actions, stored.as_ref(), options.dims)?;
 
-    let mut warnings = Vec::new();
+    let mut warnings = file.notes();
     if observations.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
         warnings.push("states are stored as float64; they were rounded to float32".to_owned());
     }

@@ -1,0 +1,304 @@
+//! Reading numbers out of HDF5 files that may be anything.
+//!
+//! `hdf5-pure` reads the data sets; what it does not do is done here: links are followed ([`names`]), what is not in the
+//! file is found before memory is asked for ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
+
+mod heap;
+mod names;
+mod numbers;
+mod storage;
+mod table;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use hdf5_pure::{AttrValue, Dataset, Datatype, File, FormatError};
+use tce_base::FileError;
+
+use self::names::{Broken, Found, Names};
+use self::storage::Unwritten;
+use crate::{DataError, Problem};
+
+const REPAIR: &str = "The file is damaged or incomplete: fetch or write it again";
+/// A file of plain data sets out of one of any kind that h5py reads.
+const COPY: &str = "`python -c \"import h5py; i = h5py.File('in.hdf5'); o = h5py.File('out.hdf5', 'w'); \
+                    [o.create_dataset(k, data=i[k][()]) for k in i if isinstance(i.get(k), h5py.Dataset)]\"`";
+
+/// An open file. Reads on demand, so that memory follows the data sets that are asked for.
+pub(super) struct Hdf5 {
+    path: PathBuf,
+    bytes: u64,
+    file: File,
+    names: Names,
+    notes: Arc<Mutex<Vec<String>>>,
+}
+
+/// One data set as a row-major f32 matrix.
+pub(super) struct Column {
+    pub data: Vec<f32>,
+    pub rows: usize,
+    pub dim: usize,
+    /// Whether numbers were stored as f64 and have been rounded.
+    pub rounded: bool,
+}
+
+/// What a field must look like.
+#[derive(Clone, Copy)]
+enum Kind {
+    /// (N, D), D >= 1. Must have been written.
+    Matrix,
+    /// (N,) or (N, 1). What was never written is the fill value.
+    Vector,
+}
+
+impl Hdf5 {
+    pub fn open(path: &Path) -> Result<Self, DataError> {
+        Self::open_noting(path, Arc::default())
+    }
+
+    /// A second handle, for another thread. Its notes are this one's.
+    pub fn reopen(&self) -> Result<Self, DataError> {
+        Self::open_noting(&self.path, Arc::clone(&self.notes))
+    }
+
+    fn open_noting(path: &Path, notes: Arc<Mutex<Vec<String>>>) -> Result<Self, DataError> {
+        let io = |action| move |e: io::Error| DataError::File(FileError::new(path, action, e));
+        let meta = fs::metadata(path).map_err(io("open"))?;
+        if meta.is_dir() {
+            return Err(io("open")(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory, not a file")));
+        }
+        let bytes = meta.len();
+        let whole = |problem, found: String, advice: &str| {
+            DataError::invalid(problem, path, "file", found, "an HDF5 file in D4RL's or OTDF's layout", advice)
+        };
+        if bytes == 0 {
+            return Err(whole(Problem::Empty, "0 bytes".into(), REPAIR));
+        }
+        if !hdf5_pure::is_hdf5(path).map_err(io("read"))? {
+            let found = format!("{bytes} bytes without the HDF5 signature");
+            return Err(whole(Problem::NotHdf5, found, "Convert the data to HDF5 first, or check the path"));
+        }
+        let file = guard(path, "file", || File::open_streaming(path))?;
+        let superblock = file.superblock();
+        let end = superblock.eof_address;
+        if end > bytes {
+            return Err(whole(Problem::Truncated, format!("{bytes} of {end} bytes"), REPAIR));
+        }
+        let names = Names::open(path, bytes, superblock).map_err(|e| unreadable(path, "file", e))?;
+        Ok(Self { path: path.to_owned(), bytes, file, names, notes })
+    }
+
+    /// Whether the top level has this name, be it a data set, a group or a link.
+    pub fn has(&self, name: &str) -> bool {
+        self.names.has(name)
+    }
+
+    /// What the user should know about the numbers read so far: those that float32 cannot hold, those never written.
+    pub fn notes(&self) -> Vec<String> {
+        let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        // Two handles may have read side by side.
+        notes.sort();
+        notes
+    }
+
+    /// The root's attributes as text.
+    pub fn attributes(&self) -> Result<BTreeMap<String, String>, DataError> {
+        let attributes = guard(&self.path, "attributes", || self.file.root().attrs())?;
+        let text = |v: AttrValue| v.as_str().map_or_else(|| v.to_string(), str::to_owned);
+        Ok(attributes.into_iter().map(|(k, v)| (k, text(v))).collect())
+    }
+
+    /// A matrix: shape (N, D), D >= 1.
+    pub fn matrix(&self, name: &str) -> Result<Column, DataError> {
+        self.read(name, Kind::Matrix)
+    }
+
+    /// A vector: shape (N,) or (N, 1).
+    pub fn vector(&self, name: &str) -> Result<Column, DataError> {
+        self.read(name, Kind::Vector)
+    }
+
+    /// A vector of 0 and 1, however it is stored.
+    pub fn flags(&self, name: &str) -> Result<Vec<bool>, DataError> {
+        let column = self.vector(name)?;
+        if let Some(row) = column.data.iter().position(|&x| x != 0.0 && x != 1.0) {
+            let found = format!("{} in row {row}", column.data[row]);
+            return Err(self.invalid(Problem::Value, name, found, "0 or 1", "Store flags as 0 and 1"));
+        }
+        Ok(column.data.iter().map(|&x| x == 1.0).collect())
+    }
+
+    pub fn invalid(
+        &self,
+        problem: Problem,
+        field: &str,
+        found: impl Into<String>,
+        expected: impl Into<String>,
+        advice: impl Into<String>,
+    ) -> DataError {
+        DataError::invalid(problem, &self.path, field, found, expected, advice)
+    }
+
+    fn note(&self, note: String) {
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
+    }
+
+    /// The data set that `name` means, through whatever links.
+    fn open_dataset(&self, name: &str) -> Result<Dataset, DataError> {
+        let path = match self.names.find(name).map_err(|e| unreadable(&self.path, name, e))? {
+            Found::At(path) => path,
+            Found::Absent => {
+                let names = self.names.list();
+                let keys = if names.is_empty() { "no data sets".into() } else { names.join(", ") };
+                return Err(self.invalid(
+                    Problem::MissingField,
+                    name,
+                    format!("no such data set (the file has {keys})"),
+                    "a data set of this name at the top level",
+                    "Check that the file holds transitions in D4RL's or OTDF's layout",
+                ));
+            }
+            Found::Group(members) => {
+                let members =
+                    if members.is_empty() { "without members".into() } else { format!("of {}", members.join(", ")) };
+                return Err(self.invalid(
+                    Problem::WrongType,
+                    name,
+                    format!("a group {members}"),
+                    "a data set of this name",
+                    "Store the numbers as one data set, or rename the group",
+                ));
+            }
+            Found::Nowhere(broken) => return Err(self.broken_link(name, broken)),
+        };
+        guard(&self.path, name, || self.file.dataset(&path))
+    }
+
+    fn broken_link(&self, name: &str, broken: Broken) -> DataError {
+        let found = match broken {
+            Broken::External { file, path } => {
+                return self.elsewhere(name, format!("an external link to `{path}` in the file `{file}`"));
+            }
+            Broken::Dangling(target) => format!("a soft link to `{target}`, which is not in the file"),
+            Broken::Circle(target) => format!("a soft link to `{target}` that leads in a circle, or too far"),
+            Broken::Unknown(kind) => format!("a link of kind {kind}, which only its writer can follow"),
+        };
+        let advice = format!("Store the numbers under this name, or remove the link: `del file[\"{name}\"]` in h5py");
+        self.invalid(Problem::MissingField, name, found, "a data set of this name", advice)
+    }
+
+    fn read(&self, name: &str, kind: Kind) -> Result<Column, DataError> {
+        let dataset = self.open_dataset(name)?;
+        let (shape, datatype) = guard(&self.path, name, || Ok((dataset.shape()?, dataset.datatype()?)))?;
+        if !numbers::is_number(&datatype) {
+            let advice = "Store numbers as float32, flags as integers or booleans";
+            let expected = "float32, float64, float16, an integer or a boolean type";
+            return Err(self.invalid(Problem::WrongType, name, format!("type {datatype}"), expected, advice));
+        }
+        let (rows, dim) = match (kind, &shape[..]) {
+            (Kind::Matrix, &[n, d]) if d > 0 => (n, d),
+            (Kind::Vector, &[n] | &[n, 1]) => (n, 1),
+            _ => {
+                let expected = match kind {
+                    Kind::Matrix => "shape (N, D)",
+                    Kind::Vector => "shape (N,) or (N, 1)",
+                };
+                let advice = "Reshape it: one row per transition";
+                return Err(self.invalid(Problem::WrongRank, name, format!("shape {shape:?}"), expected, advice));
+            }
+        };
+        if rows == 0 {
+            return Err(self.invalid(Problem::Empty, name, "0 rows", "at least one row", "Use another file"));
+        }
+        let unwritten = match kind {
+            Kind::Matrix => Unwritten::Refuse,
+            Kind::Vector => Unwritten::Fill,
+        };
+        let filled = self.ensure_stored(name, &dataset, unwritten)?;
+        let data = guard(&self.path, name, || numbers::read_f32(&dataset, &datatype))?;
+        // The product fits: `ensure_stored` has compared it with the file's size.
+        if data.len() as u64 != rows * dim {
+            let found = format!("{} numbers for shape {shape:?}", data.len());
+            return Err(self.invalid(Problem::Malformed, name, found, "as many as the shape says", REPAIR));
+        }
+        let (rows, dim) = (rows as usize, dim as usize);
+        self.ensure_finite(name, &dataset, &datatype, &data, dim)?;
+        if let Some(inexact) = guard(&self.path, name, || numbers::inexact_integers(&dataset, &datatype, &data, dim))? {
+            let (at, number) = inexact.first;
+            self.note(format!(
+                "`{name}`: {} integers have more digits than float32 holds and were rounded, the first of them {number} \
+                 in row {}, column {}",
+                inexact.count,
+                at / dim,
+                at % dim
+            ));
+        }
+        filled.into_iter().for_each(|note| self.note(note));
+        let rounded = matches!(datatype, Datatype::FloatingPoint { size: 8, .. });
+        Ok(Column { data, rows, dim, rounded })
+    }
+
+    fn ensure_finite(
+        &self,
+        name: &str,
+        dataset: &Dataset,
+        datatype: &Datatype,
+        data: &[f32],
+        dim: usize,
+    ) -> Result<(), DataError> {
+        let Some(at) = data.iter().position(|x| !x.is_finite()) else {
+            return Ok(());
+        };
+        let bad = data.iter().filter(|x| !x.is_finite()).count();
+        let place = format!("in row {}, column {} ({bad} such values)", at / dim, at % dim);
+        // An infinity may be a float64 that is none.
+        let stored = guard(&self.path, name, || Ok(numbers::finite_f64(dataset, datatype, at, dim)))?;
+        let (found, advice) = match stored {
+            Some(x) => {
+                (format!("{x:e} {place}, which does not fit float32"), "Scale the numbers, or remove these rows")
+            }
+            None => (format!("{} {place}", data[at]), "Remove these rows first"),
+        };
+        Err(self.invalid(Problem::NonFinite, name, found, "finite numbers (float32, up to 3.4e38)", advice))
+    }
+}
+
+/// Puts a failure of the link tables into our words.
+fn unreadable(path: &Path, field: &str, e: io::Error) -> DataError {
+    let problem = match e.kind() {
+        io::ErrorKind::InvalidData => Problem::Malformed,
+        io::ErrorKind::UnexpectedEof => Problem::Truncated,
+        _ => return FileError::new(path, "read", e).into(),
+    };
+    DataError::invalid(problem, path, field, e.to_string(), "a file that follows the HDF5 format", REPAIR)
+}
+
+/// Runs one call of the HDF5 library and puts its failure, a panic included, into our words.
+fn guard<T>(path: &Path, field: &str, call: impl FnOnce() -> Result<T, hdf5_pure::Error>) -> Result<T, DataError> {
+    let malformed = |problem, found: String| {
+        // What the library does not know yet is no damage.
+        let repair = if found.contains("version") || found.contains("unsupported") {
+            format!("Written by a newer HDF5, or damaged. Store it anew: {COPY}")
+        } else {
+            REPAIR.to_owned()
+        };
+        DataError::invalid(problem, path, field, found, "a file that follows the HDF5 format", repair)
+    };
+    match catch_unwind(AssertUnwindSafe(call)) {
+        Ok(Ok(value)) => Ok(value),
+        Ok(Err(hdf5_pure::Error::Io(e))) if e.kind() != io::ErrorKind::UnexpectedEof => {
+            Err(FileError::new(path, "read", e).into())
+        }
+        Ok(Err(e)) => {
+            let short =
+                matches!(e, hdf5_pure::Error::Io(_) | hdf5_pure::Error::Format(FormatError::UnexpectedEof { .. }));
+            let problem = if short { Problem::Truncated } else { Problem::Malformed };
+            Err(malformed(problem, e.to_string()))
+        }
+        Err(_) => Err(malformed(Problem::Malformed, "bytes that the HDF5 reader cannot follow".into())),
+    }
+}

@@ -1,0 +1,121 @@
+//! From a field's name to the data set it means, through whatever links lie between.
+
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use hdf5_pure::Superblock;
+
+use super::table::{Image, Link, Links, malformed};
+
+/// Soft links that one name may lead through: HDF5's own default.
+const MAX_LINKS: usize = 16;
+
+/// What a name at the top level means.
+pub(super) enum Found {
+    /// There is no such name.
+    Absent,
+    /// The object of this path of hard links, which `hdf5-pure` follows.
+    At(String),
+    /// A link that leads to no object of this file.
+    Nowhere(Broken),
+    /// A group with these members.
+    Group(Vec<String>),
+}
+
+/// Why a link leads nowhere.
+pub(super) enum Broken {
+    /// To a path that is not there.
+    Dangling(String),
+    /// Through more links than [`MAX_LINKS`].
+    Circle(String),
+    /// To another file.
+    External { file: String, path: String },
+    /// To wherever its writer knows.
+    Unknown(u8),
+}
+
+/// The names at the file's top level.
+pub(super) struct Names {
+    image: Image,
+    root: u64,
+    top: Links,
+}
+
+impl Names {
+    pub fn open(path: &Path, bytes: u64, superblock: &Superblock) -> io::Result<Self> {
+        let image = Image::new(fs::File::open(path)?, bytes, superblock);
+        // The library adds the base (a user block's bytes) to this one address.
+        let root = superblock.root_group_address.checked_sub(superblock.base_address.get());
+        let root = root.ok_or_else(|| malformed("a root before the start of the file"))?;
+        let top = image.links(root)?.ok_or_else(|| malformed("a root that is not a group"))?;
+        Ok(Self { image, root, top })
+    }
+
+    pub fn has(&self, name: &str) -> bool {
+        self.top.contains_key(name)
+    }
+
+    /// Every name at the top level: a group with a slash after it.
+    pub fn list(&self) -> Vec<String> {
+        let group = |link: &Link| matches!(link, Link::Hard(a) if matches!(self.image.links(*a), Ok(Some(_))));
+        self.top.iter().map(|(name, link)| if group(link) { format!("{name}/") } else { name.clone() }).collect()
+    }
+
+    /// Where `name` leads.
+    pub fn find(&self, name: &str) -> io::Result<Found> {
+        let Some(first) = self.top.get(name) else {
+            return Ok(Found::Absent);
+        };
+        let dangling = || match first {
+            Link::Soft(target) => Found::Nowhere(Broken::Dangling(target.clone())),
+            _ => Found::Absent,
+        };
+        let (mut at, mut path) = (self.root, Vec::new());
+        let mut followed = 0;
+        // The parts of the path still to walk, the next one last.
+        let mut parts = vec![name.to_owned()];
+        while let Some(part) = parts.pop() {
+            if part.is_empty() || part == "." {
+                continue;
+            }
+            let inner;
+            let table = if at == self.root {
+                &self.top
+            } else {
+                let Some(links) = self.image.links(at)? else {
+                    return Ok(dangling());
+                };
+                inner = links;
+                &inner
+            };
+            match table.get(&part) {
+                None => return Ok(dangling()),
+                Some(Link::Hard(address)) => {
+                    at = *address;
+                    path.push(part);
+                }
+                Some(Link::Soft(target)) => {
+                    followed += 1;
+                    if followed > MAX_LINKS {
+                        return Ok(Found::Nowhere(Broken::Circle(target.clone())));
+                    }
+                    if target.starts_with('/') {
+                        at = self.root;
+                        path.clear();
+                    }
+                    parts.extend(target.split('/').rev().map(str::to_owned));
+                }
+                Some(Link::External { file, path }) => {
+                    let (file, path) = (file.clone(), path.clone());
+                    return Ok(Found::Nowhere(Broken::External { file, path }));
+                }
+                Some(Link::Unknown(kind)) => return Ok(Found::Nowhere(Broken::Unknown(*kind))),
+            }
+        }
+        match self.image.links(at)? {
+            Some(members) => Ok(Found::Group(members.into_keys().collect())),
+            None => Ok(Found::At(path.join("/"))),
+        }
+    }
+}

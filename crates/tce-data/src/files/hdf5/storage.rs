@@ -1,0 +1,190 @@
+//! Whether a data set's numbers are in the file, and in a form that is read: looked at before anything is allocated.
+
+use hdf5_pure::{Chunk, ChunkIndex, Dataset, Error, FormatError, Layout};
+
+use super::{COPY, Hdf5, REPAIR, guard};
+use crate::{DataError, Problem};
+
+/// Deflate cannot expand by more than 1032 : 1. A data set that announces more than this times the file's size is not
+/// in the file.
+const MAX_EXPANSION: u64 = 1040;
+
+/// What to do with a data set, or a part of one, that was created and never written.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Unwritten {
+    /// Refuse it: states and actions made up of zeros are no data.
+    Refuse,
+    /// Read it as its fill value (zero if none is given), as h5py does. Its size is in no bytes of the file, so that it
+    /// must have the rows of `observations`, which must be there.
+    Fill,
+}
+
+impl Hdf5 {
+    /// Refuses a data set that the file's bytes cannot hold, that was never (completely) written, or that is stored in a
+    /// way that is not read. Returns a note about what will be filled, if anything.
+    pub(super) fn ensure_stored(
+        &self,
+        name: &str,
+        dataset: &Dataset,
+        unwritten: Unwritten,
+    ) -> Result<Option<String>, DataError> {
+        let (shape, element) = guard(&self.path, name, || Ok((dataset.shape()?, dataset.element_size()?)))?;
+        let bytes_of = |dims: &[u64]| dims.iter().try_fold(element, |n, &d| n.checked_mul(d));
+        let oversized = |announced: Option<u64>| {
+            let announced = announced.map_or("more than 2^64".to_owned(), |n| n.to_string());
+            let found = format!("{announced} bytes announced, in a file of {} bytes", self.bytes);
+            self.invalid(Problem::Oversized, name, found, "no more data than the file can hold", REPAIR)
+        };
+        let announced = bytes_of(&shape);
+        let fits = announced.is_some_and(|n| n <= self.bytes.saturating_mul(MAX_EXPANSION));
+        // What is missing is filled or refused.
+        let missing = |what: String| match unwritten {
+            Unwritten::Refuse if !fits => Err(oversized(announced)),
+            Unwritten::Refuse => Err(self.invalid(
+                Problem::Truncated,
+                name,
+                what,
+                "every row written",
+                "The program that made the file did not finish: write it again, or cut the file to the written rows",
+            )),
+            Unwritten::Fill => {
+                let (rows, here) = (self.written_rows()?, shape.first().copied().unwrap_or(1));
+                if here != rows {
+                    let found = format!("{here} rows, {what}");
+                    let advice = "The fields must have one row per transition: write the file again";
+                    return Err(self.invalid(
+                        Problem::RowCount,
+                        name,
+                        found,
+                        format!("{rows} rows, as in `observations`"),
+                        advice,
+                    ));
+                }
+                Ok(Some(format!("`{name}`: {what}; read as its fill value, as h5py does")))
+            }
+        };
+        match guard(&self.path, name, || dataset.layout())? {
+            Layout::Contiguous { address: None, .. } => {
+                // Data in a file of its own looks the same, except to a reader.
+                match guard(&self.path, name, || Ok(dataset.read_raw_rows(0, 1)))? {
+                    Err(Error::Format(FormatError::UnsupportedExternalStorage)) => {
+                        Err(self.elsewhere(name, "raw data in another file"))
+                    }
+                    _ => missing("created, but never written".into()),
+                }
+            }
+            Layout::Contiguous { .. } | Layout::Compact { .. } if announced.is_none_or(|n| n > self.bytes) => {
+                Err(oversized(announced))
+            }
+            Layout::Chunked { chunk_shape, index } => {
+                if index == ChunkIndex::BTreeV2 {
+                    let found = "chunks under a version 2 B-tree (several unlimited dimensions, libver=\"latest\")";
+                    let advice = format!("Store it anew: `h5repack -l CONTI -f NONE in.hdf5 out.hdf5`, or {COPY}");
+                    return Err(self.invalid(
+                        Problem::Unsupported,
+                        name,
+                        found,
+                        "at most one unlimited dimension",
+                        advice,
+                    ));
+                }
+                let chunk = bytes_of(&chunk_shape);
+                if chunk_shape.contains(&0) || chunk_shape.len() != shape.len() {
+                    return Err(oversized(chunk));
+                }
+                let grid = shape.iter().zip(&chunk_shape).try_fold(1u64, |n, (s, c)| n.checked_mul(s.div_ceil(*c)));
+                let grid = grid.ok_or_else(|| oversized(None))?;
+                // Every stored chunk costs an address or, where the index has none, an element: the others are missing.
+                let mut note = None;
+                if grid > self.bytes / element.clamp(1, 8) {
+                    note = missing(format!("most of its {grid} chunks never written"))?;
+                }
+                let chunks = guard(&self.path, name, || dataset.chunks())?;
+                let inside = |c: &&Chunk| c.offset.iter().zip(&shape).all(|(at, end)| at < end);
+                let written = chunks.iter().filter(inside).count() as u64;
+                if written < grid && note.is_none() {
+                    note = missing(match written {
+                        0 => "created, but never written".into(),
+                        _ => format!("{} of its {grid} chunks never written", grid - written),
+                    })?;
+                }
+                let past_end = |c: &Chunk| c.address.checked_add(c.storage_size).is_none_or(|end| end > self.bytes);
+                if chunks.iter().any(past_end) {
+                    let found = "a chunk beyond the end of the file";
+                    return Err(self.invalid(Problem::Truncated, name, found, "every chunk in the file", REPAIR));
+                }
+                let stored: u64 = chunks.iter().map(|c| c.storage_size).fold(0, u64::saturating_add);
+                let padded = (chunks.len() as u64).saturating_mul(chunk.unwrap_or(u64::MAX));
+                if padded > stored.saturating_mul(MAX_EXPANSION) {
+                    return Err(oversized(Some(padded)));
+                }
+                self.ensure_filters(name, dataset, &chunks)?;
+                if note.is_none() && !fits { Err(oversized(announced)) } else { Ok(note) }
+            }
+            Layout::Virtual => Err(self.elsewhere(name, "a virtual data set")),
+            _ => Ok(None),
+        }
+    }
+
+    /// The rows of `observations`, which must be stored.
+    fn written_rows(&self) -> Result<u64, DataError> {
+        let name = "observations";
+        let dataset = self.open_dataset(name)?;
+        self.ensure_stored(name, &dataset, Unwritten::Refuse)?;
+        let shape = guard(&self.path, name, || dataset.shape())?;
+        Ok(shape.first().copied().unwrap_or(1))
+    }
+
+    /// Refuses numbers that another file holds.
+    pub(super) fn elsewhere(&self, name: &str, found: impl Into<String>) -> DataError {
+        let advice = format!("Copy the data into one file: {COPY}");
+        self.invalid(Problem::Unsupported, name, found, "numbers in this very file", advice)
+    }
+
+    /// Refuses compressions that are not read, unless every chunk was stored without.
+    fn ensure_filters(&self, name: &str, dataset: &Dataset, chunks: &[Chunk]) -> Result<(), DataError> {
+        for (i, filter) in dataset.filters().into_iter().enumerate() {
+            let Some(unread) = unread_filter(filter) else { continue };
+            let skipped = |c: &Chunk| i < 32 && c.filter_mask >> i & 1 == 1;
+            if chunks.iter().all(skipped) {
+                continue;
+            }
+            let found = format!("compression by {} (HDF5 filter {filter})", unread.name);
+            let advice = match unread.part_of_hdf5 {
+                true => "Store it anew: `h5repack -f GZIP=4 in.hdf5 out.hdf5`".to_owned(),
+                false => format!(
+                    "Store it anew, after `pip install hdf5plugin`: {}",
+                    COPY.replace("h5py;", "h5py, hdf5plugin;")
+                ),
+            };
+            return Err(self.invalid(Problem::Unsupported, name, found, "gzip, lzf or no compression", advice));
+        }
+        Ok(())
+    }
+}
+
+struct Unread {
+    name: &'static str,
+    /// Whether h5repack reads it without a plugin.
+    part_of_hdf5: bool,
+}
+
+/// A filter that `hdf5-pure` does not undo.
+fn unread_filter(id: u16) -> Option<Unread> {
+    let (name, part_of_hdf5) = match id {
+        // Deflate, shuffle, Fletcher-32, scale-offset, LZF.
+        1..=3 | 6 | 32000 => return None,
+        4 => ("szip", true),
+        5 => ("n-bit", true),
+        305 => ("LZO", false),
+        307 => ("bzip2", false),
+        32001 => ("Blosc", false),
+        32004 => ("LZ4", false),
+        32008 => ("bitshuffle", false),
+        32013 => ("ZFP", false),
+        32015 => ("Zstandard", false),
+        32026 => ("Blosc2", false),
+        _ => ("an unknown plugin", false),
+    };
+    Some(Unread { name, part_of_hdf5 })
+}

@@ -1,0 +1,326 @@
+//! The link tables of groups, out of the file's own bytes.
+//!
+//! `hdf5-pure` follows hard links only: soft and external links are absent from its listings, or an error. So the names
+//! are read here: object headers (versions 1 and 2), symbol tables (old-style groups), link messages (new-style groups)
+//! and dense link storage (new-style groups of more than eight links: a fractal heap behind a version 2 B-tree).
+//! Nothing here trusts a number of the file: every read is checked against the file's length and [`MAX_READ`].
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Error, ErrorKind, Read, Result, Seek, SeekFrom};
+use std::sync::{Mutex, PoisonError};
+
+use hdf5_pure::Superblock;
+
+use super::heap::Heap;
+
+/// More than any header block, heap segment or tree node of a valid file has.
+pub(super) const MAX_READ: u64 = 16 << 20;
+/// Nodes of one tree: bounds the work on a damaged file, whose nodes may form a circle.
+const MAX_NODES: usize = 100_000;
+
+const LINK_INFO: u16 = 0x02;
+const LINK: u16 = 0x06;
+const CONTINUATION: u16 = 0x10;
+const SYMBOL_TABLE: u16 = 0x11;
+
+/// One entry of a group.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Link {
+    /// The object whose header is at this address.
+    Hard(u64),
+    /// Another path of the same file.
+    Soft(String),
+    /// A path of another file.
+    External { file: String, path: String },
+    /// A kind that only the writing program knows.
+    Unknown(u8),
+}
+
+pub(super) type Links = BTreeMap<String, Link>;
+
+/// The file as addresses and fields of the widths its superblock announces.
+pub(super) struct Image {
+    /// Reading moves the file's position: one thread at a time.
+    file: Mutex<File>,
+    bytes: u64,
+    base: u64,
+    /// Bytes of an address.
+    pub offset: usize,
+    /// Bytes of a length.
+    pub length: usize,
+}
+
+pub(super) fn malformed(what: impl Into<String>) -> Error {
+    Error::new(ErrorKind::InvalidData, what.into())
+}
+
+/// Little-endian fields from the start of a block.
+pub(super) struct Fields<'a>(pub &'a [u8]);
+
+impl<'a> Fields<'a> {
+    pub fn take(&mut self, n: usize) -> Result<&'a [u8]> {
+        let (head, tail) = self.0.split_at_checked(n).ok_or_else(|| malformed("a block that ends within a field"))?;
+        self.0 = tail;
+        Ok(head)
+    }
+
+    /// An unsigned number of `n` <= 8 bytes.
+    pub fn uint(&mut self, n: usize) -> Result<u64> {
+        Ok(self.take(n)?.iter().rev().fold(0, |value, &byte| value << 8 | u64::from(byte)))
+    }
+
+    pub fn byte(&mut self) -> Result<u8> {
+        Ok(self.take(1)?[0])
+    }
+
+    pub fn signature(&mut self, name: &str) -> Result<()> {
+        let found = self.take(name.len())?;
+        if found == name.as_bytes() { Ok(()) } else { Err(malformed(format!("no {name} block where one should be"))) }
+    }
+
+    fn text(&mut self, n: usize) -> Result<String> {
+        Ok(String::from_utf8_lossy(self.take(n)?).into_owned())
+    }
+}
+
+/// The text before the first NUL byte.
+fn until_nul(bytes: &[u8]) -> Result<String> {
+    let end = bytes.iter().position(|&b| b == 0).ok_or_else(|| malformed("a name without an end"))?;
+    Ok(String::from_utf8_lossy(&bytes[..end]).into_owned())
+}
+
+impl Image {
+    pub fn new(file: File, bytes: u64, superblock: &Superblock) -> Self {
+        let (offset, length) = (superblock.offset_size as usize, superblock.length_size as usize);
+        Self { file: Mutex::new(file), bytes, base: superblock.base_address.get(), offset, length }
+    }
+
+    /// Whether an address means "nothing there".
+    pub fn undefined(&self, address: u64) -> bool {
+        address == u64::MAX >> (64 - 8 * self.offset.clamp(1, 8))
+    }
+
+    /// `length` bytes at `address`.
+    pub fn read(&self, address: u64, length: u64) -> Result<Vec<u8>> {
+        let start = self.base.checked_add(address).filter(|_| !self.undefined(address));
+        let start = start.ok_or_else(|| malformed("an address outside of the file"))?;
+        if length > MAX_READ {
+            return Err(malformed(format!("a block of {length} bytes")));
+        }
+        if start.checked_add(length).is_none_or(|end| end > self.bytes) {
+            return Err(Error::new(ErrorKind::UnexpectedEof, format!("a block beyond the end, at byte {start}")));
+        }
+        let mut block = vec![0; length as usize];
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        file.seek(SeekFrom::Start(start))?;
+        file.read_exact(&mut block)?;
+        Ok(block)
+    }
+
+    /// The links of the group whose object header is at `header`; `None` if the object is not a group.
+    pub fn links(&self, header: u64) -> Result<Option<Links>> {
+        let mut links = Links::new();
+        let mut group = false;
+        for (kind, body) in self.messages(header)? {
+            let mut f = Fields(&body);
+            match kind {
+                SYMBOL_TABLE => {
+                    group = true;
+                    let (tree, heap) = (f.uint(self.offset)?, f.uint(self.offset)?);
+                    self.symbol_table(tree, heap, &mut links)?;
+                }
+                LINK => {
+                    group = true;
+                    let (name, link) = self.link(&body)?;
+                    links.insert(name, link);
+                }
+                LINK_INFO => {
+                    group = true;
+                    f.byte()?;
+                    let flags = f.byte()?;
+                    if flags & 1 != 0 {
+                        f.take(8)?;
+                    }
+                    let (heap, index) = (f.uint(self.offset)?, f.uint(self.offset)?);
+                    if !self.undefined(heap) && !self.undefined(index) {
+                        for message in Heap::open(self, heap)?.all(index)? {
+                            let (name, link) = self.link(&message)?;
+                            links.insert(name, link);
+                        }
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(group.then_some(links))
+    }
+
+    /// The messages of an object header: type and body.
+    fn messages(&self, header: u64) -> Result<Vec<(u16, Vec<u8>)>> {
+        let start = self.read(header, 4)?;
+        let modern = start == *b"OHDR";
+        let mut blocks = Vec::new();
+        let mut order = false;
+        if modern {
+            let flags = self.read(header, 6)?[5];
+            let times = if flags & 0x20 != 0 { 16 } else { 0 };
+            let attributes = if flags & 0x10 != 0 { 4 } else { 0 };
+            order = flags & 0x04 != 0;
+            let width = 1 << (flags & 3);
+            let prefix = 6 + times + attributes + width;
+            let size = Fields(&self.read(header, prefix)?[(prefix - width) as usize..]).uint(width as usize)?;
+            let at = header.checked_add(prefix).ok_or_else(|| malformed("an address outside of the file"))?;
+            blocks.push(self.read(at, size)?);
+        } else if start[0] == 1 {
+            let prefix = self.read(header, 16)?;
+            let size = Fields(&prefix[8..]).uint(4)?;
+            blocks.push(self.read(header + 16, size)?);
+        } else {
+            return Err(malformed(format!("object header version {}", start[0])));
+        }
+        let mut messages = Vec::new();
+        let mut left = MAX_READ;
+        let mut next = 0;
+        while next < blocks.len() {
+            let block = std::mem::take(&mut blocks[next]);
+            next += 1;
+            let mut f = Fields(&block);
+            let prefix = if modern { 4 + 2 * usize::from(order) } else { 8 };
+            // What is shorter than a message is a gap.
+            while f.0.len() >= prefix {
+                let mut head = Fields(f.take(prefix)?);
+                let kind = if modern { u16::from(head.byte()?) } else { head.uint(2)? as u16 };
+                let size = head.uint(2)? as usize;
+                let body = f.take(size)?;
+                if kind == CONTINUATION {
+                    let mut c = Fields(body);
+                    let (address, length) = (c.uint(self.offset)?, c.uint(self.length)?);
+                    left =
+                        left.checked_sub(length.max(8)).ok_or_else(|| malformed("an object header without an end"))?;
+                    let more = self.read(address, length)?;
+                    blocks.push(if modern {
+                        let inner = more.strip_prefix(b"OCHK").filter(|b| b.len() >= 4);
+                        let inner = inner.ok_or_else(|| malformed("no OCHK block where one should be"))?;
+                        inner[..inner.len() - 4].to_vec()
+                    } else {
+                        more
+                    });
+                } else if matches!(kind, LINK | LINK_INFO | SYMBOL_TABLE) {
+                    messages.push((kind, body.to_vec()));
+                }
+            }
+        }
+        Ok(messages)
+    }
+
+    /// One link message.
+    fn link(&self, message: &[u8]) -> Result<(String, Link)> {
+        let mut f = Fields(message);
+        let version = f.byte()?;
+        if version != 1 {
+            return Err(malformed(format!("link message version {version}")));
+        }
+        let flags = f.byte()?;
+        let kind = if flags & 0x08 != 0 { f.byte()? } else { 0 };
+        if flags & 0x04 != 0 {
+            f.take(8)?; // creation order
+        }
+        if flags & 0x10 != 0 {
+            f.byte()?; // character set
+        }
+        let length = f.uint(1 << (flags & 3))?;
+        let name = f.text(usize::try_from(length).unwrap_or(usize::MAX))?;
+        let link = match kind {
+            0 => Link::Hard(f.uint(self.offset)?),
+            1 => {
+                let length = f.uint(2)? as usize;
+                Link::Soft(f.text(length)?)
+            }
+            64 => {
+                let length = f.uint(2)? as usize;
+                let value = f.take(length)?;
+                // A byte of version and flags, then two texts.
+                let value = value.get(1..).unwrap_or_default();
+                let file = until_nul(value)?;
+                let rest = value.iter().position(|&b| b == 0).map_or(&[][..], |end| &value[end + 1..]);
+                Link::External { file, path: until_nul(rest)? }
+            }
+            other => Link::Unknown(other),
+        };
+        Ok((name, link))
+    }
+
+    /// An old-style group: a tree of nodes of entries, with the texts in a heap.
+    fn symbol_table(&self, tree: u64, heap: u64, links: &mut Links) -> Result<()> {
+        let header = self.read(heap, 8 + 2 * self.length as u64 + self.offset as u64)?;
+        let mut f = Fields(&header);
+        f.signature("HEAP")?;
+        f.take(4)?;
+        let size = f.uint(self.length)?;
+        f.take(self.length)?;
+        let segment = self.read(f.uint(self.offset)?, size)?;
+        // Texts may not overlap in a valid file, so that all of them together are no longer than the heap.
+        let mut left = segment.len();
+        let mut text = |at: u64| -> Result<String> {
+            let rest = usize::try_from(at).ok().and_then(|at| segment.get(at..));
+            let text = until_nul(rest.ok_or_else(|| malformed("a name outside of its heap"))?)?;
+            left = left.checked_sub(text.len()).ok_or_else(|| malformed("names that overlap"))?;
+            Ok(text)
+        };
+        let mut nodes = vec![(tree, None)];
+        let mut visited = 0;
+        while let Some((address, level)) = nodes.pop() {
+            visited += 1;
+            if visited > MAX_NODES {
+                return Err(malformed("a tree of names without an end"));
+            }
+            if level == Some(0) {
+                self.symbols(address, &mut text, links)?;
+                continue;
+            }
+            let prefix = 8 + 2 * self.offset as u64;
+            let head = self.read(address, prefix)?;
+            let mut f = Fields(&head);
+            f.signature("TREE")?;
+            f.byte()?;
+            let own = f.uint(1)?;
+            let entries = f.uint(2)?;
+            if level.is_some_and(|above| own + 1 != above) {
+                return Err(malformed("a tree of names whose levels do not descend"));
+            }
+            let pair = (self.length + self.offset) as u64;
+            let block = self.read(address, prefix + entries * pair)?;
+            let mut f = Fields(&block[prefix as usize..]);
+            for _ in 0..entries {
+                f.take(self.length)?;
+                // Level 0 of the tree points to nodes of entries: one level further down.
+                nodes.push((f.uint(self.offset)?, Some(own)));
+            }
+        }
+        Ok(())
+    }
+
+    /// One node of entries of an old-style group.
+    fn symbols(&self, address: u64, text: &mut impl FnMut(u64) -> Result<String>, links: &mut Links) -> Result<()> {
+        let head = self.read(address, 8)?;
+        let mut f = Fields(&head);
+        f.signature("SNOD")?;
+        f.take(2)?;
+        let entries = f.uint(2)?;
+        let size = (self.length + self.offset + 24) as u64;
+        let block = self.read(address, 8 + entries * size)?;
+        let mut f = Fields(&block[8..]);
+        for _ in 0..entries {
+            let name = text(f.uint(self.length)?)?;
+            let object = f.uint(self.offset)?;
+            let cached = f.uint(4)?;
+            f.take(4)?;
+            let scratch = f.take(16)?;
+            // 2: a soft link, its text's place in the heap in the scratch space.
+            let link = if cached == 2 { Link::Soft(text(Fields(scratch).uint(4)?)?) } else { Link::Hard(object) };
+            links.insert(name, link);
+        }
+        Ok(())
+    }
+}
