@@ -11,6 +11,10 @@ use crate::{DataError, Problem, Transitions};
 
 /// Bytes per chunk before compression: large enough to compress well, small enough to inflate a few at a time.
 const CHUNK_BYTES: usize = 512 * 1024;
+/// Longest side of a chunk, in elements. `hdf5-pure` writes a side of 65,536 and more with four bytes, where three would
+/// do; HDF5 2.0 recomputes the width and refuses every other ("stored chunk dimension encoding length"). Sides of up to
+/// 255 and up to 65,535 have one width in both.
+const MAX_CHUNK_SIDE: usize = 65_535;
 /// Float32 noise hardly compresses; higher levels cost time and save nothing.
 const DEFLATE_LEVEL: u32 = 4;
 
@@ -68,8 +72,8 @@ pub fn save_d4rl(
 
 fn compress(dataset: &mut DatasetBuilder, shape: &[usize], element: usize) {
     let row_bytes = element * shape[1..].iter().product::<usize>();
-    let mut chunk: Vec<u64> = shape.iter().map(|&d| d as u64).collect();
-    chunk[0] = shape[0].min((CHUNK_BYTES / row_bytes).max(1)) as u64;
+    let mut chunk: Vec<u64> = shape.iter().map(|&d| d.min(MAX_CHUNK_SIDE) as u64).collect();
+    chunk[0] = chunk[0].min((CHUNK_BYTES / row_bytes).max(1) as u64);
     let shape: Vec<u64> = shape.iter().map(|&d| d as u64).collect();
     dataset.with_shape(&shape).with_chunks(&chunk).with_shuffle().with_deflate(DEFLATE_LEVEL);
 }
