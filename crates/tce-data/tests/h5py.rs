@@ -3,22 +3,9 @@
 mod common;
 
 use std::collections::BTreeMap;
-use std::process::Command;
 
+use common::python;
 use tce_data::{LoadOptions, load, save_d4rl};
-
-/// Runs `script` with `argument`; `None` if there is no Python with h5py (`TCE_PYTHON`, default python3).
-fn python(script: &str, argument: &std::path::Path) -> Option<String> {
-    let python = std::env::var("TCE_PYTHON").unwrap_or_else(|_| "python3".into());
-    let able = Command::new(&python).args(["-c", "import h5py, numpy"]).output().is_ok_and(|o| o.status.success());
-    if !able {
-        eprintln!("SKIPPED: {python} cannot import h5py and numpy (set TCE_PYTHON)");
-        return None;
-    }
-    let out = Command::new(&python).args(["-c", script]).arg(argument).output().unwrap();
-    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
-    Some(String::from_utf8(out.stdout).unwrap())
-}
 
 #[test]
 fn h5py_reads_our_files() {
@@ -98,7 +85,7 @@ with h5py.File(sys.argv[1], "w") as f:
     d = f.create_dataset("observations", shape=(n, 17), dtype="f4", chunks=(1000, 17), compression="gzip")
     d[:1000] = 1.0
     f.create_dataset("actions", shape=(n, 6), dtype="f4")
-    f.create_dataset("rewards", shape=(100,), dtype="f4", chunks=(10,))
+    f.create_dataset("rewards", data=np.zeros(100, "f4"))
     f.create_dataset("terminals", data=np.zeros(100, bool))
 "#;
     if python(script, &path).is_none() {
@@ -108,4 +95,28 @@ with h5py.File(sys.argv[1], "w") as f:
     let error = load(&path, &LoadOptions::default()).unwrap_err();
     assert_eq!(error.problem(), Some(tce_data::Problem::Oversized), "{error}");
     assert!(started.elapsed().as_secs() < 5);
+
+    // Vectors are filled where nothing was written, but not to any length.
+    for kind in
+        ["shape=(n,), dtype='f4'", "shape=(n,), dtype=bool, chunks=(10,)", "shape=(n,), dtype=bool, chunks=(10**9,)"]
+    {
+        for name in ["rewards", "terminals", "timeouts"] {
+            let script = format!(
+                r#"
+import sys, h5py, numpy as np
+n = 10**12
+with h5py.File(sys.argv[1], "w") as f:
+    for name, shape in [("observations", (100, 2)), ("actions", (100, 1)), ("rewards", 100), ("terminals", 100), ("timeouts", 100)]:
+        if name != "{name}":
+            f[name] = np.zeros(shape, "f4")
+    f.create_dataset("{name}", {kind})
+"#
+            );
+            python(&script, &path);
+            let error = load(&path, &LoadOptions::default()).unwrap_err();
+            let parts = ["1000000000000 rows", "never written", "100 rows, as in `observations`"];
+            common::assert_refused(error, tce_data::Problem::RowCount, &path, name, &parts);
+        }
+    }
+    assert!(started.elapsed().as_secs() < 60);
 }

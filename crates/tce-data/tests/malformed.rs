@@ -159,7 +159,17 @@ fn nan_and_infinity_are_located_in_every_field() {
         b.create_dataset("rewards").with_f64_data(&[0.0, 1e300, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     });
     let path = write(&dir, "a.hdf5", b);
-    assert_refused(load(&path).unwrap_err(), Problem::NonFinite, &path, "rewards", &["inf in row 1"]);
+    let parts = ["1e300 in row 1, column 0", "does not fit float32", "3.4e38"];
+    assert_refused(load(&path).unwrap_err(), Problem::NonFinite, &path, "rewards", &parts);
+    let b = without("observations", |b| {
+        let mut data = [0.0; 16];
+        data[11] = -1e39;
+        data[13] = f64::NAN;
+        b.create_dataset("observations").with_f64_data(&data).with_shape(&[8, 2]);
+    });
+    let path = write(&dir, "a.hdf5", b);
+    let parts = ["-1e39 in row 5, column 1 (2 such values)", "does not fit float32"];
+    assert_refused(load(&path).unwrap_err(), Problem::NonFinite, &path, "observations", &parts);
 }
 
 #[test]
@@ -205,6 +215,47 @@ fn wrong_types_values_and_dimensions() {
         &["2 columns", "17 columns", "another agent"],
     );
     assert_refused(of((2, 6)), Problem::Dimension, &path, "actions", &["1 columns", "6 columns"]);
+}
+
+#[test]
+fn a_group_in_a_fields_place_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    for field in ["observations", "next_observations", "timeouts"] {
+        let b = without(field, |b| {
+            let mut group = b.create_group(field);
+            group.create_dataset("qpos").with_f32_data(&[0.0; 8]);
+            group.create_dataset("qvel").with_f32_data(&[0.0; 8]);
+            b.add_group(group.finish());
+        });
+        let path = write(&dir, "a.hdf5", b);
+        let parts = ["a group of qpos, qvel", "a data set", "rename the group"];
+        assert_refused(load(&path).unwrap_err(), Problem::WrongType, &path, field, &parts);
+    }
+}
+
+/// Float32 skips integers from 2^24 on: a file that loses digits says so, one that does not is silent.
+#[test]
+fn integers_that_lose_digits_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let rewards = |rewards: &[i64; 8]| {
+        let b = without("rewards", |b| {
+            b.create_dataset("rewards").with_i64_data(rewards);
+        });
+        load(&write(&dir, "a.hdf5", b)).unwrap().report.warnings
+    };
+    assert_eq!(rewards(&[0, 1, -7, 1 << 24, -(1 << 24), 1 << 40, i64::MIN, 3]), Vec::<String>::new());
+    let warnings = rewards(&[0, 1, (1 << 24) + 1, 1 << 40, (1 << 53) + 1, i64::MAX, 0, 0]);
+    assert_eq!(warnings.len(), 1, "{warnings:?}");
+    for part in ["`rewards`", "3 integers", "16777217 in row 2"] {
+        assert!(warnings[0].contains(part), "{}", warnings[0]);
+    }
+    let b = without("observations", |b| {
+        let mut data = [0u64; 16];
+        data[9] = u64::MAX;
+        b.create_dataset("observations").with_u64_data(&data).with_shape(&[8, 2]);
+    });
+    let warnings = load(&write(&dir, "a.hdf5", b)).unwrap().report.warnings;
+    assert!(warnings[0].contains("`observations`") && warnings[0].contains("18446744073709551615 in row 4, column 1"));
 }
 
 #[test]

@@ -2,6 +2,7 @@
 #![allow(dead_code)]
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use hdf5_pure::{EnumTypeBuilder, FileBuilder, make_i8_type};
 use tce_data::{DataError, LoadOptions, Loaded, Problem, Transitions};
@@ -117,4 +118,18 @@ pub fn shared() -> Option<PathBuf> {
     let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
     let path = std::env::var_os("TCE_SHARED").map_or(default, PathBuf::from);
     path.join("datasets/otdf").is_dir().then_some(path)
+}
+
+/// Runs `script` with `argument`; `None` if there is no Python with h5py (`TCE_PYTHON`, default python3).
+#[track_caller]
+pub fn python(script: &str, argument: &Path) -> Option<String> {
+    let python = std::env::var("TCE_PYTHON").unwrap_or_else(|_| "python3".into());
+    let able = Command::new(&python).args(["-c", "import h5py, numpy"]).output().is_ok_and(|o| o.status.success());
+    if !able {
+        eprintln!("SKIPPED: {python} cannot import h5py and numpy (set TCE_PYTHON)");
+        return None;
+    }
+    let out = Command::new(&python).args(["-c", script]).arg(argument).output().unwrap();
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    Some(String::from_utf8(out.stdout).unwrap())
 }

@@ -175,7 +175,14 @@ impl Hdf5 {
             }
             Found::Nowhere(broken) => return Err(self.broken_link(name, broken)),
         };
-        guard(&self.path, name, || self.file.dataset(&path))
+        let other = |_| {
+            let (found, expected) = ("an object that is neither a data set nor a group", "a data set of this name");
+            self.invalid(Problem::WrongType, name, found, expected, "Store the numbers as a data set of this name")
+        };
+        guard(&self.path, name, || match self.file.dataset(&path) {
+            Err(hdf5_pure::Error::NotADataset(what)) => Ok(Err(other(what))),
+            opened => opened.map(Ok),
+        })?
     }
 
     fn broken_link(&self, name: &str, broken: Broken) -> DataError {

@@ -79,7 +79,7 @@ impl Hdf5 {
             Layout::Chunked { chunk_shape, index } => {
                 if index == ChunkIndex::BTreeV2 {
                     let found = "chunks under a version 2 B-tree (several unlimited dimensions, libver=\"latest\")";
-                    let advice = format!("Store it anew: `h5repack -l CONTI -f NONE in.hdf5 out.hdf5`, or {COPY}");
+                    let advice = format!("Store it anew: {COPY}");
                     return Err(self.invalid(
                         Problem::Unsupported,
                         name,
