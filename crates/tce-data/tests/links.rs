@@ -169,7 +169,7 @@ f["timeouts"] = h5py.SoftLink("/column 3/t")
             let step = whole.len() / 700 + 1;
             for at in (0..whole.len()).step_by(step) {
                 let mut bytes = whole.clone();
-                bytes[at] = if at / step % 2 == 0 { whole[at] ^ 1 << (at % 8) } else { 0xff };
+                bytes[at] = if (at / step).is_multiple_of(2) { whole[at] ^ 1 << (at % 8) } else { 0xff };
                 fs::write(&path, &bytes).unwrap();
                 match load(&path) {
                     Ok(_) => read += 1,
