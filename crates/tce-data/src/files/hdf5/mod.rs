@@ -4,6 +4,7 @@
 //! file is found before memory is asked for ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
 
 mod heap;
+mod modern;
 mod names;
 mod numbers;
 mod storage;
@@ -149,8 +150,8 @@ impl Hdf5 {
 
     /// The data set that `name` means, through whatever links.
     fn open_dataset(&self, name: &str) -> Result<Dataset, DataError> {
-        let path = match self.names.find(name).map_err(|e| unreadable(&self.path, name, e))? {
-            Found::At(path) => path,
+        let (path, header) = match self.names.find(name).map_err(|e| unreadable(&self.path, name, e))? {
+            Found::At { path, header } => (path, header),
             Found::Absent => {
                 let names = self.names.list();
                 let keys = if names.is_empty() { "no data sets".into() } else { names.join(", ") };
@@ -179,7 +180,11 @@ impl Hdf5 {
             let (found, expected) = ("an object that is neither a data set nor a group", "a data set of this name");
             self.invalid(Problem::WrongType, name, found, expected, "Store the numbers as a data set of this name")
         };
-        guard(&self.path, name, || match self.file.dataset(&path) {
+        let patch = self.names.as_version_4(header).map_err(|e| unreadable(&self.path, name, e))?;
+        let shown =
+            patch.map(|patch| guard(&self.path, name, || modern::open(&self.path, self.bytes, patch))).transpose()?;
+        let file = shown.as_ref().unwrap_or(&self.file);
+        guard(&self.path, name, || match file.dataset(&path) {
             Err(hdf5_pure::Error::NotADataset(what)) => Ok(Err(other(what))),
             opened => opened.map(Ok),
         })?

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use hdf5_pure::Superblock;
 
-use super::table::{Image, Link, Links, malformed};
+use super::table::{Image, Link, Links, Patch, malformed};
 
 /// Soft links that one name may lead through: HDF5's own default.
 const MAX_LINKS: usize = 16;
@@ -16,7 +16,7 @@ pub(super) enum Found {
     /// There is no such name.
     Absent,
     /// The object of this path of hard links, which `hdf5-pure` follows.
-    At(String),
+    At { path: String, header: u64 },
     /// A link that leads to no object of this file.
     Nowhere(Broken),
     /// A group with these members.
@@ -115,7 +115,12 @@ impl Names {
         }
         match self.image.links(at)? {
             Some(members) => Ok(Found::Group(members.into_keys().collect())),
-            None => Ok(Found::At(path.join("/"))),
+            None => Ok(Found::At { path: path.join("/"), header: at }),
         }
+    }
+
+    /// What to show of a data set that HDF5 2.0 wrote in its newest format.
+    pub fn as_version_4(&self, header: u64) -> io::Result<Option<Patch>> {
+        self.image.as_version_4(header)
     }
 }

@@ -13,6 +13,7 @@ use std::sync::{Mutex, PoisonError};
 use hdf5_pure::Superblock;
 
 use super::heap::Heap;
+use super::modern::lookup3;
 
 /// More than any header block, heap segment or tree node of a valid file has.
 pub(super) const MAX_READ: u64 = 16 << 20;
@@ -21,6 +22,7 @@ const MAX_NODES: usize = 100_000;
 
 const LINK_INFO: u16 = 0x02;
 const LINK: u16 = 0x06;
+const LAYOUT: u16 = 0x08;
 const CONTINUATION: u16 = 0x10;
 const SYMBOL_TABLE: u16 = 0x11;
 
@@ -35,6 +37,22 @@ pub(super) enum Link {
     External { file: String, path: String },
     /// A kind that only the writing program knows.
     Unknown(u8),
+}
+
+/// One message of an object header.
+struct Message {
+    kind: u16,
+    body: Vec<u8>,
+    /// Address of the body.
+    at: u64,
+    /// Address and length of what the block's checksum covers; the checksum follows. Old headers have none.
+    checked: Option<(u64, u64)>,
+}
+
+/// Bytes to show in the place of the file's own, from an absolute position on.
+pub(super) struct Patch {
+    pub start: u64,
+    pub bytes: Vec<u8>,
 }
 
 pub(super) type Links = BTreeMap<String, Link>;
@@ -122,7 +140,7 @@ impl Image {
     pub fn links(&self, header: u64) -> Result<Option<Links>> {
         let mut links = Links::new();
         let mut group = false;
-        for (kind, body) in self.messages(header)? {
+        for Message { kind, body, .. } in self.messages(header)? {
             let mut f = Fields(&body);
             match kind {
                 SYMBOL_TABLE => {
@@ -156,10 +174,32 @@ impl Image {
         Ok(group.then_some(links))
     }
 
-    /// The messages of an object header: type and body.
-    fn messages(&self, header: u64) -> Result<Vec<(u16, Vec<u8>)>> {
+    /// A data set's header with version 4 in the place of version 5 of its layout message, if it has that; see
+    /// [`modern`](super::modern).
+    pub fn as_version_4(&self, header: u64) -> Result<Option<Patch>> {
+        let found = self.messages(header)?.into_iter().find(|m| m.kind == LAYOUT && m.body.first() == Some(&5));
+        let Some(Message { at, checked, .. }) = found else {
+            return Ok(None);
+        };
+        let Some((start, length)) = checked else {
+            return Ok(Some(Patch { start: self.base + at, bytes: vec![4] }));
+        };
+        let mut bytes = self.read(start, length + 4)?;
+        let sum = |bytes: &[u8]| lookup3(&bytes[..length as usize]).to_le_bytes();
+        if bytes[length as usize..] != sum(&bytes) {
+            return Err(malformed("an object header with a wrong checksum"));
+        }
+        bytes[(at - start) as usize] = 4;
+        let new = sum(&bytes);
+        bytes[length as usize..].copy_from_slice(&new);
+        Ok(Some(Patch { start: self.base + start, bytes }))
+    }
+
+    /// The messages of an object header that are looked at here.
+    fn messages(&self, header: u64) -> Result<Vec<Message>> {
         let start = self.read(header, 4)?;
         let modern = start == *b"OHDR";
+        // Blocks to look through: the address of their first message, the messages, what the checksum covers.
         let mut blocks = Vec::new();
         let mut order = false;
         if modern {
@@ -170,21 +210,18 @@ impl Image {
             let width = 1 << (flags & 3);
             let prefix = 6 + times + attributes + width;
             let size = Fields(&self.read(header, prefix)?[(prefix - width) as usize..]).uint(width as usize)?;
-            let at = header.checked_add(prefix).ok_or_else(|| malformed("an address outside of the file"))?;
-            blocks.push(self.read(at, size)?);
+            let at = header + prefix;
+            blocks.push((at, self.read(at, size)?, Some((header, prefix + size))));
         } else if start[0] == 1 {
             let prefix = self.read(header, 16)?;
             let size = Fields(&prefix[8..]).uint(4)?;
-            blocks.push(self.read(header + 16, size)?);
+            blocks.push((header + 16, self.read(header + 16, size)?, None));
         } else {
             return Err(malformed(format!("object header version {}", start[0])));
         }
         let mut messages = Vec::new();
         let mut left = MAX_READ;
-        let mut next = 0;
-        while next < blocks.len() {
-            let block = std::mem::take(&mut blocks[next]);
-            next += 1;
+        while let Some((first, block, checked)) = blocks.pop() {
             let mut f = Fields(&block);
             let prefix = if modern { 4 + 2 * usize::from(order) } else { 8 };
             // What is shorter than a message is a gap.
@@ -192,6 +229,7 @@ impl Image {
                 let mut head = Fields(f.take(prefix)?);
                 let kind = if modern { u16::from(head.byte()?) } else { head.uint(2)? as u16 };
                 let size = head.uint(2)? as usize;
+                let at = first + (block.len() - f.0.len()) as u64;
                 let body = f.take(size)?;
                 if kind == CONTINUATION {
                     let mut c = Fields(body);
@@ -200,14 +238,15 @@ impl Image {
                         left.checked_sub(length.max(8)).ok_or_else(|| malformed("an object header without an end"))?;
                     let more = self.read(address, length)?;
                     blocks.push(if modern {
-                        let inner = more.strip_prefix(b"OCHK").filter(|b| b.len() >= 4);
+                        let inner =
+                            more.strip_prefix(b"OCHK").and_then(|b| b.len().checked_sub(4).map(|end| &b[..end]));
                         let inner = inner.ok_or_else(|| malformed("no OCHK block where one should be"))?;
-                        inner[..inner.len() - 4].to_vec()
+                        (address + 4, inner.to_vec(), Some((address, length - 4)))
                     } else {
-                        more
+                        (address, more, None)
                     });
-                } else if matches!(kind, LINK | LINK_INFO | SYMBOL_TABLE) {
-                    messages.push((kind, body.to_vec()));
+                } else if matches!(kind, LINK | LINK_INFO | SYMBOL_TABLE | LAYOUT) {
+                    messages.push(Message { kind, body: body.to_vec(), at, checked });
                 }
             }
         }
