@@ -99,6 +99,44 @@ for libver in VERSIONS:
     assert!(read == 66, "{read} files");
 }
 
+/// Chunks of 65,536 rows and more, whose sides HDF5 stores in three bytes.
+#[test]
+fn large_chunks_read_right() {
+    let dir = tempfile::tempdir().unwrap();
+    let script = r#"
+n = 140_000
+i = np.arange(n, dtype=np.float32)
+ends = np.arange(n) % 1000 == 999
+FIELDS = dict(observations=np.stack([i, -i], 1), actions=np.full((n, 1), .5, np.float32), next_observations=None,
+              rewards=i, terminals=np.zeros(n, bool), timeouts=ends)
+for libver in VERSIONS:
+    for block in [0, 512]:
+        new = lambda name: open_file(f"{name} {libver} {block}", libver, userblock_size=block)
+        def rows(f, k, v, m, **options):
+            more = dict(maxshape=(None,) + v.shape[1:]) if options.pop("grows", False) else {}
+            f.create_dataset(k, data=v, chunks=(m,) + v.shape[1:], **more, **options)
+        for m in [65_535, 65_536, 100_000, n]:
+            fill(new(f"{m}"), partial(rows, m=m))
+            fill(new(f"{m} gzip"), partial(rows, m=m, compression="gzip", compression_opts=1, shuffle=True))
+            fill(new(f"{m} grows"), partial(rows, m=m, compression="gzip", compression_opts=1, grows=True))
+"#;
+    if python(&format!("{PREPARE}{script}"), dir.path()).is_none() {
+        return;
+    }
+    let mut read = 0;
+    for entry in fs::read_dir(dir.path()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap();
+        let got = load(&path).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let kept: Vec<f32> = (0..140_000).filter(|i| i % 1000 != 999).map(|i| i as f32).collect();
+        assert_eq!(got.transitions.rewards, kept, "{name}");
+        let states: Vec<f32> = kept.iter().flat_map(|x| [*x, -x]).collect();
+        assert_eq!(got.transitions.observations, states, "{name}");
+        read += 1;
+    }
+    assert_eq!(read, 72);
+}
+
 /// What was created and never written: the fill value for vectors (as h5py reads it), refused for states and actions.
 #[test]
 fn unwritten_fields() {

@@ -1,8 +1,10 @@
 //! Files as other programs write them.
 #![allow(dead_code)]
 
+use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use hdf5_pure::{EnumTypeBuilder, FileBuilder, make_i8_type};
 use tce_data::{DataError, LoadOptions, Loaded, Problem, Transitions};
@@ -132,4 +134,21 @@ pub fn python(script: &str, argument: &Path) -> Option<String> {
     let out = Command::new(&python).args(["-c", script]).arg(argument).output().unwrap();
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     Some(String::from_utf8(out.stdout).unwrap())
+}
+
+/// Notes the largest single allocation of a test program that makes it its `global_allocator`.
+pub struct Largest;
+
+pub static LARGEST: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: everything is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Largest {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        LARGEST.fetch_max(layout.size(), Relaxed);
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
 }

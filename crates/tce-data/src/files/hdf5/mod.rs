@@ -1,7 +1,8 @@
 //! Reading numbers out of HDF5 files that may be anything.
 //!
-//! `hdf5-pure` reads the data sets; what it does not do is done here: links are followed ([`names`]), what is not in the
-//! file is found before memory is asked for ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
+//! `hdf5-pure` reads the data sets; what it does not do is done here: links are followed ([`names`]), newer layout
+//! messages are put into its terms ([`modern`]), what is not in the file is found before memory is asked for
+//! ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
 
 mod heap;
 mod modern;
@@ -180,7 +181,7 @@ impl Hdf5 {
             let (found, expected) = ("an object that is neither a data set nor a group", "a data set of this name");
             self.invalid(Problem::WrongType, name, found, expected, "Store the numbers as a data set of this name")
         };
-        let patch = self.names.as_version_4(header).map_err(|e| unreadable(&self.path, name, e))?;
+        let patch = self.names.readable_layout(header).map_err(|e| unreadable(&self.path, name, e))?;
         let shown =
             patch.map(|patch| guard(&self.path, name, || modern::open(&self.path, self.bytes, patch))).transpose()?;
         let file = shown.as_ref().unwrap_or(&self.file);

@@ -1,9 +1,12 @@
-//! Data sets that HDF5 2.0 writes with libver="latest".
+//! Layout messages that `hdf5-pure` does not read, rewritten into those that it does.
 //!
-//! The layout message of a compressed one has version 5, which `hdf5-pure` refuses. It differs from version 4 in one
-//! thing: the size of a compressed chunk takes eight bytes in the chunk index, not as few as will do. The index states
-//! how wide its entries are and `hdf5-pure` goes by that, so that it reads such a data set once its header says 4. The
-//! library is shown the file with this one header changed: the version, and the checksum over it.
+//! Two kinds are in files written by h5py with libver="latest":
+//! - Version 5 (HDF5 2.0, compressed data sets). It differs from version 4 in one thing: the size of a compressed chunk
+//!   takes eight bytes in the chunk index, not as few as will do. The index states how wide its entries are, and the
+//!   library goes by that: it reads such a data set once the message says 4.
+//! - Chunk sides of three bytes (HDF5 1.10 and later, chunks of 65,536 rows and more). The library knows 1, 2, 4 and 8.
+//!
+//! The library is shown a file whose header has the rewritten message.
 
 use std::fs;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -20,6 +23,33 @@ pub(super) fn open(path: &Path, bytes: u64, patch: Patch) -> Result<File, Error>
     File::from_source(Patched { file: Mutex::new(file), bytes, patch })
 }
 
+/// The message that says the same in the library's terms; `None` if it is in them already, or is none of ours.
+pub(super) fn rewritten(layout: &[u8]) -> Option<Vec<u8>> {
+    let &[version @ (4 | 5), class, ref rest @ ..] = layout else {
+        return None;
+    };
+    // 2: chunked, with flags, the number of sides, their width, and the sides.
+    let &[flags, sides, width, ref rest @ ..] = rest else {
+        return None;
+    };
+    let wider = match width {
+        3 => 4,
+        5..=7 => 8,
+        other => other,
+    };
+    if class != 2 || wider == width || rest.len() < usize::from(sides) * usize::from(width) {
+        return (version == 5).then(|| [&[4], &layout[1..]].concat());
+    }
+    let mut new = vec![4, class, flags, sides, wider];
+    let (old, rest) = rest.split_at(usize::from(sides) * usize::from(width));
+    for side in old.chunks_exact(usize::from(width)) {
+        new.extend(side);
+        new.resize(new.len() + usize::from(wider - width), 0);
+    }
+    new.extend(rest);
+    Some(new)
+}
+
 struct Patched {
     file: Mutex<fs::File>,
     bytes: u64,
@@ -28,24 +58,33 @@ struct Patched {
 
 impl Source for Patched {
     fn len(&self) -> u64 {
-        self.bytes
+        self.bytes + self.patch.behind.len() as u64
     }
 
     fn read_at(&self, offset: u64, buf: &mut [u8]) -> Result<(), FormatError> {
         let told = |e: io::Error| FormatError::Source(e.to_string());
+        let inside = buf.len().min(self.bytes.saturating_sub(offset) as usize);
         {
             let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
             file.seek(SeekFrom::Start(offset)).map_err(told)?;
-            file.read_exact(buf).map_err(told)?;
+            file.read_exact(&mut buf[..inside]).map_err(told)?;
         }
-        let Patch { start, bytes } = &self.patch;
-        let first = offset.max(*start);
-        let last = (offset + buf.len() as u64).min(start + bytes.len() as u64);
-        if first < last {
-            let new = &bytes[(first - start) as usize..(last - start) as usize];
-            buf[(first - offset) as usize..(last - offset) as usize].copy_from_slice(new);
+        overlay(buf, offset, &self.patch.bytes, self.patch.start);
+        overlay(buf, offset, &self.patch.behind, self.bytes);
+        if offset.saturating_add(buf.len() as u64) > self.len() {
+            return Err(FormatError::Source("beyond the end of the file".into()));
         }
         Ok(())
+    }
+}
+
+/// Writes what `new`, which starts at `start`, and `buf`, which starts at `offset`, have in common into `buf`.
+fn overlay(buf: &mut [u8], offset: u64, new: &[u8], start: u64) {
+    let first = offset.max(start);
+    let last = offset.saturating_add(buf.len() as u64).min(start + new.len() as u64);
+    if first < last {
+        let new = &new[(first - start) as usize..(last - start) as usize];
+        buf[(first - offset) as usize..(last - offset) as usize].copy_from_slice(new);
     }
 }
 
@@ -83,12 +122,37 @@ pub(super) fn lookup3(data: &[u8]) -> u32 {
 
 #[cfg(test)]
 mod tests {
-    use super::lookup3;
+    use super::{lookup3, overlay, rewritten};
 
     /// Jenkins's own examples, and lengths around a block.
     #[test]
     fn known_sums() {
         assert_eq!(lookup3(b""), 0xdead_beef);
         assert_eq!(lookup3(b"Four score and seven years ago"), 0x1777_0551);
+    }
+
+    #[test]
+    fn layouts_are_rewritten() {
+        // Version 4, two-byte sides: nothing to do. Version 5: the version alone. Three-byte sides: four.
+        assert_eq!(rewritten(&[4, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]), None);
+        assert_eq!(rewritten(&[5, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]).unwrap(), [4, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]);
+        let wide = [4, 2, 1, 2, 4, 0, 0, 1, 0, 4, 0, 0, 0, 1, 9];
+        assert_eq!(rewritten(&[4, 2, 1, 2, 3, 0, 0, 1, 4, 0, 0, 1, 9]).unwrap(), wide);
+        assert_eq!(rewritten(&[5, 2, 1, 2, 3, 0, 0, 1, 4, 0, 0, 1, 9]).unwrap(), wide);
+        assert_eq!(rewritten(&[3, 2, 1, 2, 3, 0, 0, 1]), None);
+        assert_eq!(rewritten(&[4, 2, 1, 200, 3, 0, 0, 1]), None);
+        assert_eq!(rewritten(&[4]), None);
+    }
+
+    #[test]
+    fn overlays_meet_at_every_offset() {
+        let whole = [0, 1, 2, 13, 14, 15, 6, 7];
+        for start in 0..8u64 {
+            for end in start..=8 {
+                let mut buf: Vec<u8> = (start as u8..end as u8).collect();
+                overlay(&mut buf, start, &[13, 14, 15], 3);
+                assert_eq!(buf, whole[start as usize..end as usize], "{start}..{end}");
+            }
+        }
     }
 }

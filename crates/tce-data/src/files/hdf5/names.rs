@@ -119,8 +119,8 @@ impl Names {
         }
     }
 
-    /// What to show of a data set that HDF5 2.0 wrote in its newest format.
-    pub fn as_version_4(&self, header: u64) -> io::Result<Option<Patch>> {
-        self.image.as_version_4(header)
+    /// What to show of a data set that the library does not read as it is.
+    pub fn readable_layout(&self, header: u64) -> io::Result<Option<Patch>> {
+        self.image.readable_layout(header)
     }
 }

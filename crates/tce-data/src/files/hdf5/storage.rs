@@ -43,7 +43,7 @@ impl Hdf5 {
             Unwritten::Refuse => Err(self.invalid(
                 Problem::Truncated,
                 name,
-                what,
+                format!("no complete data ({what})"),
                 "every row written",
                 "The program that made the file did not finish: write it again, or cut the file to the written rows",
             )),

@@ -13,7 +13,7 @@ use std::sync::{Mutex, PoisonError};
 use hdf5_pure::Superblock;
 
 use super::heap::Heap;
-use super::modern::lookup3;
+use super::modern::{self, lookup3};
 
 /// More than any header block, heap segment or tree node of a valid file has.
 pub(super) const MAX_READ: u64 = 16 << 20;
@@ -43,16 +43,21 @@ pub(super) enum Link {
 struct Message {
     kind: u16,
     body: Vec<u8>,
+    /// Bytes before the body: its kind first, its size next.
+    prefix: Vec<u8>,
     /// Address of the body.
     at: u64,
     /// Address and length of what the block's checksum covers; the checksum follows. Old headers have none.
     checked: Option<(u64, u64)>,
 }
 
-/// Bytes to show in the place of the file's own, from an absolute position on.
+/// A file with other bytes in some places, and more of them.
 pub(super) struct Patch {
+    /// Shown from this position on in the place of the file's own bytes.
     pub start: u64,
     pub bytes: Vec<u8>,
+    /// Shown behind the file's end.
+    pub behind: Vec<u8>,
 }
 
 pub(super) type Links = BTreeMap<String, Link>;
@@ -174,25 +179,36 @@ impl Image {
         Ok(group.then_some(links))
     }
 
-    /// A data set's header with version 4 in the place of version 5 of its layout message, if it has that; see
-    /// [`modern`](super::modern).
-    pub fn as_version_4(&self, header: u64) -> Result<Option<Patch>> {
-        let found = self.messages(header)?.into_iter().find(|m| m.kind == LAYOUT && m.body.first() == Some(&5));
-        let Some(Message { at, checked, .. }) = found else {
+    /// A data set's header with a layout message that the library reads in the place of one that it does not; `None` if
+    /// it reads the one that is there. See [`modern`](super::modern).
+    pub fn readable_layout(&self, header: u64) -> Result<Option<Patch>> {
+        let layout = self.messages(header)?.into_iter().find(|m| m.kind == LAYOUT);
+        let Some((Message { body, mut prefix, at, checked: Some((start, length)), .. }, new)) =
+            layout.and_then(|m| modern::rewritten(&m.body).map(|new| (m, new)))
+        else {
             return Ok(None);
         };
-        let Some((start, length)) = checked else {
-            return Ok(Some(Patch { start: self.base + at, bytes: vec![4] }));
-        };
+        // The new message may be longer. So it stands in a block of its own behind the file's end, and a continuation
+        // message, which says where that is, in the place of the old one.
+        if body.len() < self.offset + self.length {
+            return Ok(None);
+        }
+        prefix[1..3].copy_from_slice(&(new.len() as u16).to_le_bytes());
+        let mut behind = [b"OCHK", &prefix[..], &new].concat();
+        behind.extend(lookup3(&behind).to_le_bytes());
         let mut bytes = self.read(start, length + 4)?;
-        let sum = |bytes: &[u8]| lookup3(&bytes[..length as usize]).to_le_bytes();
-        if bytes[length as usize..] != sum(&bytes) {
+        let (old, sum) = bytes.split_at_mut(length as usize);
+        if *sum != lookup3(old).to_le_bytes() {
             return Err(malformed("an object header with a wrong checksum"));
         }
-        bytes[(at - start) as usize] = 4;
-        let new = sum(&bytes);
-        bytes[length as usize..].copy_from_slice(&new);
-        Ok(Some(Patch { start: self.base + start, bytes }))
+        let at = (at - start) as usize;
+        old[at - prefix.len()] = CONTINUATION as u8;
+        let target = &mut old[at..at + body.len()];
+        target.fill(0);
+        target[..self.offset].copy_from_slice(&(self.bytes - self.base).to_le_bytes()[..self.offset]);
+        target[self.offset..][..self.length].copy_from_slice(&(behind.len() as u64).to_le_bytes()[..self.length]);
+        sum.copy_from_slice(&lookup3(old).to_le_bytes());
+        Ok(Some(Patch { start: self.base + start, bytes, behind }))
     }
 
     /// The messages of an object header that are looked at here.
@@ -226,7 +242,8 @@ impl Image {
             let prefix = if modern { 4 + 2 * usize::from(order) } else { 8 };
             // What is shorter than a message is a gap.
             while f.0.len() >= prefix {
-                let mut head = Fields(f.take(prefix)?);
+                let before = f.take(prefix)?;
+                let mut head = Fields(before);
                 let kind = if modern { u16::from(head.byte()?) } else { head.uint(2)? as u16 };
                 let size = head.uint(2)? as usize;
                 let at = first + (block.len() - f.0.len()) as u64;
@@ -246,7 +263,7 @@ impl Image {
                         (address, more, None)
                     });
                 } else if matches!(kind, LINK | LINK_INFO | SYMBOL_TABLE | LAYOUT) {
-                    messages.push(Message { kind, body: body.to_vec(), at, checked });
+                    messages.push(Message { kind, body: body.to_vec(), prefix: before.to_vec(), at, checked });
                 }
             }
         }
