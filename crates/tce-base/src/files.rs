@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use sha2::{Digest, Sha256};
-use tempfile::NamedTempFile;
+use tempfile::{NamedTempFile, TempDir};
 
 use crate::owner::Owner;
 
@@ -97,14 +97,63 @@ impl AtomicFile {
     }
 }
 
-/// Removes the temporary files that killed processes of this machine left in `directory`. Whatever they were to become is not there,
+/// A folder in the making, as [`AtomicFile`] is a file in the making. Dropped without a commit, it leaves nothing behind.
+pub struct AtomicFolder {
+    target: PathBuf,
+    temporary: TempDir,
+}
+
+impl AtomicFolder {
+    /// Starts `target`, in the folder that it will be in (created if missing).
+    pub fn create(target: &Path) -> Result<Self, FileError> {
+        let directory = parent(target);
+        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        sweep(directory);
+        let temporary = tempfile::Builder::new()
+            .prefix(&format!("{PREFIX}{}.", Owner::this()))
+            .suffix(SUFFIX)
+            .tempdir_in(directory)
+            .map_err(|e| FileError::new(target, "create a temporary folder beside it", e))?;
+        Ok(Self { target: target.to_owned(), temporary })
+    }
+
+    /// Where the files go until the commit. Whoever writes one flushes it.
+    pub fn path(&self) -> &Path {
+        self.temporary.path()
+    }
+
+    /// Gives the folder its final name. What has that name, be it a file or a full folder, is not replaced.
+    ///
+    /// # Errors
+    /// If it cannot be renamed.
+    pub fn commit(self) -> Result<(), FileError> {
+        let Self { target, temporary } = self;
+        if target.exists() {
+            let taken = io::Error::new(io::ErrorKind::AlreadyExists, "something of that name is there");
+            return Err(FileError::new(&target, "rename into place", taken));
+        }
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            fs::set_permissions(temporary.path(), fs::Permissions::from_mode(0o755))
+                .map_err(|e| FileError::new(&target, "set the permissions", e))?;
+        }
+        fs::rename(temporary.path(), &target).map_err(|e| FileError::new(&target, "rename into place", e))?;
+        // It has another name now; there is nothing left to remove.
+        let _ = temporary.keep();
+        flush_directory(&target)
+    }
+}
+
+/// Removes the temporary files and folders that killed processes of this machine left in `directory`. Whatever they were to become is not there,
 /// so whoever needs it comes by here to make it.
 fn sweep(directory: &Path) {
     for entry in fs::read_dir(directory).into_iter().flatten().flatten() {
         let name = entry.file_name();
         let owned = name.to_str().and_then(|n| n.strip_prefix(PREFIX)?.strip_suffix(SUFFIX));
         if owned.and_then(|n| Owner::of(Path::new(n))).is_some_and(|owner| owner.dead()) {
-            let _ = fs::remove_file(entry.path());
+            let path = entry.path();
+            let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
         }
     }
 }
@@ -268,6 +317,20 @@ mod tests {
         write_atomically(&dir.path().join("result"), b"whole").unwrap();
         assert!(!dead.exists() && elsewhere.exists() && mine.path().exists());
         mine.commit().unwrap();
+    }
+
+    #[test]
+    fn a_folder_is_whole_or_absent_and_replaces_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("deep/set");
+        let folder = AtomicFolder::create(&target).unwrap();
+        fs::write(folder.path().join("a"), b"a").unwrap();
+        assert!(!target.exists());
+        folder.commit().unwrap();
+        assert_eq!(fs::read(target.join("a")).unwrap(), b"a");
+        drop(AtomicFolder::create(&target).unwrap());
+        assert!(AtomicFolder::create(&target).unwrap().commit().unwrap_err().to_string().contains("is there"));
+        assert_eq!(fs::read_dir(dir.path().join("deep")).unwrap().count(), 1);
     }
 
     #[test]

@@ -8,8 +8,8 @@ pub mod random;
 pub mod sealed;
 
 pub use files::{
-    AtomicFile, FileError, first_damaged, link_first, move_into_place, read_if_there, sha256_file, sha256_hex,
-    write_atomically, write_json, write_json_first,
+    AtomicFile, AtomicFolder, FileError, first_damaged, link_first, move_into_place, read_if_there, sha256_file,
+    sha256_hex, write_atomically, write_json, write_json_first,
 };
 pub use owner::Owner;
 pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};

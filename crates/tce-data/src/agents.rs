@@ -8,8 +8,8 @@ pub(crate) const ANT_ZEROS: usize = 84;
 /// Source and target are not data of the same robot.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "source and target are of different agents: the source looks like {source_agent}, the target like \
-     {target_agent}. Source and target must share the state and action space; choose files of the same agent"
+    "source and target are of different robots: found a source of {source_agent}, a target of {target_agent}; expected the same state \
+     and action space. Choose files of the same robot"
 )]
 pub struct AgentMismatch {
     /// What the source looks like.
@@ -51,15 +51,27 @@ pub(crate) fn describe(data: &Transitions) -> String {
     format!("{name} ({} observations, {} actions)", data.obs_dim, data.act_dim)
 }
 
-/// Refuses a source and a target of different robots: their dimensions differ, or the agents inferred for each are
-/// disjoint.
-pub fn ensure_same_agent(source: &Transitions, target: &Transitions) -> Result<(), AgentMismatch> {
+/// Refuses a source and a target of different robots: their dimensions differ, or `named` is a robot of the benchmark and one of the
+/// files looks like another. Nobody's own robot is taken for one of the benchmark's.
+pub fn ensure_same_agent(
+    source: &Transitions,
+    target: &Transitions,
+    named: Option<Agent>,
+) -> Result<(), AgentMismatch> {
     let same_dims = (source.obs_dim, source.act_dim) == (target.obs_dim, target.act_dim);
-    let (a, b) = (infer_agents(source), infer_agents(target));
-    let compatible = a.is_empty() && b.is_empty() || a.iter().any(|x| b.contains(x));
-    if same_dims && compatible {
+    let other = |data: &Transitions| {
+        let found = infer_agents(data);
+        named.is_some_and(|agent| {
+            agent.dims() != (data.obs_dim, data.act_dim) || (!found.is_empty() && !found.contains(&agent))
+        })
+    };
+    if same_dims && !other(source) && !other(target) {
         return Ok(());
     }
+    let describe = |data: &Transitions| match named {
+        Some(_) => describe(data),
+        None => format!("{} observations and {} actions", data.obs_dim, data.act_dim),
+    };
     Err(AgentMismatch { source_agent: describe(source), target_agent: describe(target) })
 }
 
@@ -105,7 +117,7 @@ pub(crate) mod tests {
     fn different_agents_are_refused_by_name() {
         for a in Agent::ALL {
             for b in Agent::ALL {
-                let result = ensure_same_agent(&looks_like(a), &looks_like(b));
+                let result = ensure_same_agent(&looks_like(a), &looks_like(b), Some(b));
                 if a == b {
                     assert_eq!(result, Ok(()));
                     continue;
@@ -114,7 +126,16 @@ pub(crate) mod tests {
                 assert!(message.contains(a.name()) && message.contains(b.name()), "{message}");
             }
         }
-        assert!(ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 3)).is_err());
-        assert!(ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 2)).is_ok());
+    }
+
+    #[test]
+    fn own_robots_are_told_apart_by_their_dimensions_alone() {
+        let message =
+            ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 3), None).unwrap_err().to_string();
+        assert!(message.contains("4 observations and 2 actions"), "{message}");
+        assert!(ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 2), None).is_ok());
+        // A 17 x 6 arm whose base is turned.
+        let (a, b) = (looks_like(Agent::Walker2d), looks_like(Agent::HalfCheetah));
+        assert!(ensure_same_agent(&a, &b, None).is_ok());
     }
 }

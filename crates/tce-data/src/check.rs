@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::agents::{ANT_ZEROS, describe, infer_agents};
 use crate::moments::Moments;
-use crate::{Agent, Rows, Transitions};
+use crate::{ActionRange, Agent, Rows, Support, Transitions};
 
 /// Actions may leave the box [-1, 1] by this much: float32 rounding of a tanh.
 pub(crate) const ACTION_TOLERANCE: f32 = 1e-4;
@@ -102,8 +102,34 @@ pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
     if let Some((severity, message)) = dead_dimensions(data, agent) {
         add(severity, "observations", message);
     }
-    if let Some(message) = actions_outside(&data.actions, data.act_dim) {
-        add(Severity::Warning, "actions", message);
+    match agent {
+        Some(_) => {
+            if let Some(message) = actions_outside(&data.actions, data.act_dim) {
+                add(Severity::Warning, "actions", message);
+            }
+        }
+        None => {
+            if let Some(range) = ActionRange::of(&[data]) {
+                let message = format!(
+                    "they range over {range}: scaled to [-1, 1] inside, results are in these units (--action-range)"
+                );
+                add(Severity::Note, "actions", message);
+            }
+        }
+    }
+    if data.len() > 1 && data.rewards.iter().all(|&r| r == data.rewards[0]) {
+        let message = format!("every reward is {}; returns tell nothing of how good an episode is", data.rewards[0]);
+        add(Severity::Note, "rewards", message);
+    }
+    // Constant columns have a finding of their own.
+    let support = Support { constants: Vec::new(), ..Support::fit(&[&data.observations], data.obs_dim) };
+    support.describe().into_iter().for_each(|line| add(Severity::Note, "observations", line));
+    let single = data.episodes().iter().filter(|e| e.end - e.start == 1).count();
+    if single > 1 && single * 10 > data.len() {
+        let message = format!(
+            "{single} episodes have one step; what follows episodes (returns, the better trajectories, sequence models) learns nothing from them"
+        );
+        add(Severity::Warning, "timeouts", message);
     }
     let duplicate_share = duplicate_share(data);
     if duplicate_share > 0.01 {
@@ -139,7 +165,7 @@ fn dead_dimensions(data: &Transitions, agent: Option<Agent>) -> Option<(Severity
 }
 
 /// In words: which actions leave the box [-1, 1] by more than float32 rounding. `None` if none does.
-pub(crate) fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
+fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
     let outside = |x: &&f32| x.abs() > 1.0 + ACTION_TOLERANCE;
     let count = actions.iter().filter(outside).count();
     let at = actions.iter().position(|x| outside(&x))?;
@@ -188,7 +214,8 @@ mod tests {
                     assert!(e.contains(a.name()) && e.contains(b.name()), "{e}");
                 }
             }
-            assert_eq!(check(&looks_like(Agent::Ant), Some(Agent::Ant)).findings, []);
+            let worse = |f: &&Finding| f.severity > Severity::Note;
+            assert_eq!(check(&looks_like(Agent::Ant), Some(Agent::Ant)).findings.iter().find(worse), None);
         }
     }
 
@@ -211,5 +238,28 @@ mod tests {
         let text = found(&|t| t.extend(&t.clone()), Agent::Hopper);
         assert!(text.contains("50.0 % of the rows repeat"), "{text}");
         assert!(!check(&Transitions::new(11, 3), None).is_ok());
+    }
+
+    #[test]
+    fn what_an_own_robot_should_know_is_told() {
+        let mut t = Transitions::new(2, 1);
+        for i in 0..400 {
+            let x = i as f32 * 0.01 + if i > 249 { 50.0 } else { 0.0 };
+            t.push(&[x, 3.0], &[20.0 * (i as f32).sin()], 0.0, &[x + 0.01, 3.0], false, i == 99);
+        }
+        let told =
+            |t: &Transitions| check(t, None).findings.iter().map(Finding::to_string).collect::<Vec<_>>().join("\n");
+        let text = told(&t);
+        for part in [
+            "note: rewards: every reward is 0",
+            "note: observations: dimensions [1] never change",
+            "note: actions: they range over -",
+        ] {
+            assert!(text.contains(part), "{part} is not in:\n{text}");
+        }
+        assert!(!text.contains("lie outside of [-1, 1]"), "{text}");
+        assert!(!text.contains("one step"), "{text}");
+        (0..50).for_each(|i| t.timeouts[i] = true);
+        assert!(told(&t).contains("warning: timeouts: 50 episodes have one step"), "{}", told(&t));
     }
 }

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::moments::Moments;
-use crate::{ReferenceScores, Rows, Transitions};
+use crate::{Episode, ReferenceScores, Rows, Transitions};
 
 /// Mean, spread and range of one number per episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -109,12 +109,15 @@ impl Inspection {
     }
 }
 
-/// Measures `data`. An episode is complete if it ended by a terminal or is at most two rows short of `step_limit`: the
-/// public files lost a row or two of their time-outs.
-pub fn inspect(data: &Transitions, step_limit: usize) -> Inspection {
+/// Measures `data`. An episode is complete if it ended by a terminal, or by a time-out: with a `step_limit`, if it is at most two rows
+/// short of it (the public files lost a row or two of their time-outs), otherwise if its end is marked.
+pub fn inspect(data: &Transitions, step_limit: Option<usize>) -> Inspection {
     let episodes = data.episodes();
-    let complete: Vec<_> =
-        episodes.iter().filter(|e| data.terminals[e.end - 1] || e.end - e.start + 2 >= step_limit).collect();
+    let timed_out = |e: &&Episode| match step_limit {
+        Some(limit) => e.end - e.start + 2 >= limit,
+        None => data.timeouts[e.end - 1],
+    };
+    let complete: Vec<_> = episodes.iter().filter(|e| data.terminals[e.end - 1] || timed_out(e)).collect();
     let returns = if complete.is_empty() {
         Summary::of(episodes.iter().map(|e| e.episode_return))
     } else {
@@ -148,7 +151,7 @@ mod tests {
             // Episodes: 3 rows to a terminal, 3 rows to the limit, 1 row cut by the end of the file.
             t.push(&[i as f32, 0.5], &[0.1], 2.0, &[i as f32 + 1.0, f32::NAN], i == 2, i == 5);
         }
-        let got = inspect(&t, 5);
+        let got = inspect(&t, Some(5));
         assert_eq!((got.rows, got.episodes, got.complete_episodes), (7, 3, 2));
         assert_eq!((got.terminals, got.timeouts), (1, 1));
         assert_eq!(got.returns, Summary { count: 2, mean: 6.0, std: 0.0, min: 6.0, max: 6.0 });
@@ -156,12 +159,16 @@ mod tests {
         assert_eq!(got.observations.dead, [1]);
         assert_eq!((got.observations.mean[0], got.observations.std[0]), (3.0, 2.0));
         assert_eq!((got.next_observations.nan, got.next_observations.max[1]), (7, 0.0));
+        // Without a limit a marked time-out is an end like any other.
+        assert_eq!(inspect(&t, None).complete_episodes, 2);
+        t.timeouts[5] = false;
+        assert_eq!(inspect(&t, None).complete_episodes, 1);
         assert!(serde_json::to_string(&got).unwrap().contains("\"complete_episodes\":2"));
     }
 
     #[test]
     fn an_empty_table_has_numbers_too() {
-        let got = inspect(&Transitions::new(2, 1), 1000);
+        let got = inspect(&Transitions::new(2, 1), None);
         assert_eq!((got.rows, got.episodes, got.returns.mean), (0, 0, 0.0));
     }
 }

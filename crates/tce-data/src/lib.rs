@@ -16,6 +16,7 @@
 //!
 //! Everything here is deterministic: the same bytes at any number of threads.
 
+mod actions;
 mod agents;
 mod check;
 pub mod density;
@@ -36,11 +37,15 @@ mod trajectories;
 mod transitions;
 mod transport;
 
+pub use actions::ActionRange;
 pub use agents::{AgentMismatch, ensure_same_agent, infer_agents};
 pub use check::{Check, Finding, Severity, check};
 pub use density::{DensityOptions, DensityScale, DensityScores, density_scores, further_scores};
 pub use error::{DataError, Problem};
-pub use files::{Dropped, Layout, LoadOptions, LoadReport, Loaded, Successors, load, read_attributes, save_d4rl};
+pub use files::{
+    Dropped, EpisodeEnds, Layout, LoadOptions, LoadReport, Loaded, Successors, load, main_file, read_attributes,
+    save_d4rl, save_minari,
+};
 pub use filter::{largest_z, zscore_keep};
 pub use inspect::{DimensionSummary, Inspection, Summary, inspect};
 pub use neighbours::{NeighbourOptions, Units, lambda_quantile_select, nn_distances};

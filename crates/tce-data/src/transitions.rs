@@ -1,5 +1,6 @@
 //! The one table every other crate reads and writes.
 
+use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
@@ -70,6 +71,9 @@ pub struct Transitions {
     pub terminals: Vec<bool>,
     /// Whether the episode was cut after this row for another reason than a terminal, `[len]`.
     pub timeouts: Vec<bool>,
+    /// Whether s' is known, `[len]`. Where it is not, the row is terminal and `next_observations` repeats s: enough for whoever learns
+    /// values or imitates, nothing for whoever learns the dynamics ([`Transitions::with_successors`]).
+    pub known: Vec<bool>,
 }
 
 /// Rows `start..end` of one episode.
@@ -100,6 +104,7 @@ impl Transitions {
             next_observations: Vec::with_capacity(rows * obs_dim),
             terminals: Vec::with_capacity(rows),
             timeouts: Vec::with_capacity(rows),
+            known: Vec::with_capacity(rows),
         }
     }
 
@@ -137,6 +142,7 @@ impl Transitions {
         self.next_observations.extend_from_slice(s2);
         self.terminals.push(terminal);
         self.timeouts.push(timeout);
+        self.known.push(true);
     }
 
     /// Appends all rows of `other`.
@@ -151,6 +157,7 @@ impl Transitions {
         self.next_observations.extend_from_slice(&other.next_observations);
         self.terminals.extend_from_slice(&other.terminals);
         self.timeouts.extend_from_slice(&other.timeouts);
+        self.known.extend_from_slice(&other.known);
     }
 
     /// The rows at `indices`, in that order. A row whose successor in this table is not its successor in the selection
@@ -168,8 +175,18 @@ impl Transitions {
                 self.terminals[i],
                 timeout,
             );
+            out.known[k] = self.known[i];
         }
         out
+    }
+
+    /// The rows whose s' is known.
+    pub fn with_successors(&self) -> Cow<'_, Transitions> {
+        if self.known.iter().all(|&known| known) {
+            return Cow::Borrowed(self);
+        }
+        let rows: Vec<usize> = (0..self.len()).filter(|&i| self.known[i]).collect();
+        Cow::Owned(self.select(&rows))
     }
 
     /// Episodes in row order: each ends at a terminal, at a time-out, or at the last row.

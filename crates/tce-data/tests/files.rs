@@ -4,8 +4,8 @@ mod common;
 
 use std::collections::BTreeMap;
 
-use common::{Rows, load, rows, write};
-use tce_data::{Dropped, Layout, LoadOptions, Successors, Transitions, read_attributes, save_d4rl};
+use common::{Rows, load, rebuilt, rows, write};
+use tce_data::{Dropped, EpisodeEnds, Layout, LoadOptions, Successors, Transitions, read_attributes, save_d4rl};
 
 fn starts_and_ends(t: &Transitions) -> Vec<(usize, usize)> {
     t.episodes().iter().map(|e| (e.start, e.end)).collect()
@@ -47,15 +47,18 @@ fn the_step_limit_is_an_option() {
 fn rebuilt_successors_are_dropped_and_their_episodes_stay_cut() {
     let dir = tempfile::tempdir().unwrap();
     // Two episodes of 1000 steps, one terminal after 500; successors built as the next row everywhere.
-    let mut r = rows(2600);
+    let mut r = rebuilt(&[1000, 1000, 500, 100]);
     r.terminals[2499] = true;
     let got = load(&write(&dir, "a.hdf5", r.otdf())).unwrap();
-    assert_eq!(got.report.dropped, Dropped { wrong_successor: 3, ..Dropped::default() });
-    assert_eq!(starts_and_ends(&got.transitions), [(0, 999), (999, 1998), (1998, 2497), (2497, 2597)]);
-    assert!(got.transitions.timeouts[998] && got.transitions.timeouts[1997] && got.transitions.timeouts[2496]);
-    assert!(got.transitions.terminals.iter().all(|t| !t));
+    assert_eq!(got.report.dropped, Dropped { wrong_successor: 2, ..Dropped::default() });
+    let t = &got.transitions;
+    assert_eq!(starts_and_ends(t), [(0, 999), (999, 1998), (1998, 2498), (2498, 2598)]);
+    assert!(t.timeouts[998] && t.timeouts[1997]);
+    // The terminal row stays for whoever learns from its reward; its successor is not known.
+    assert!(t.terminals[2497] && !t.known[2497] && t.next_observation(2497) == t.observation(2497));
+    assert_eq!((got.report.unknown_successors, t.with_successors().len()), (1, 2597));
     let text = got.report.to_string();
-    assert!(text.contains("2597 of 2600 rows; dropped 3 for a wrong stored successor"), "{text}");
+    assert!(text.contains("2598 of 2600 rows; dropped 2 for a wrong stored successor"), "{text}");
 }
 
 /// What `d4rl.qlearning_dataset` returns for this file, row by row.
@@ -68,12 +71,14 @@ fn d4rl_without_successors_follows_qlearning_dataset() {
     let got = load(&write(&dir, "a.hdf5", r.d4rl())).unwrap();
     assert_eq!((got.report.layout, got.report.successors), (Layout::D4rl, Successors::NextRow));
     assert_eq!(got.report.dropped, Dropped { time_out: 1, last_row: 1, wrong_successor: 0 });
-    assert_eq!(got.report.terminals_without_successor, 1);
+    assert_eq!((got.report.unknown_successors, got.report.episodes), (1, EpisodeEnds::Marks));
     let t = &got.transitions;
     let first: Vec<f32> = (0..t.len()).map(|i| t.observation(i)[0]).collect();
     let next: Vec<f32> = (0..t.len()).map(|i| t.next_observation(i)[0]).collect();
     assert_eq!(first, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 8.0]);
-    assert_eq!(next, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0]);
+    // `qlearning_dataset` has 4, the next episode's first state, as successor of the terminal row 3.
+    assert_eq!(next, [1.0, 2.0, 3.0, 3.0, 5.0, 6.0, 8.0, 9.0]);
+    assert_eq!((0..8).filter(|&i| !t.known[i]).collect::<Vec<_>>(), [3]);
     assert_eq!(starts_and_ends(t), [(0, 4), (4, 6), (6, 8)]);
     assert_eq!(t.terminals.iter().filter(|&&x| x).count(), 1);
 }
@@ -95,13 +100,14 @@ fn d4rl_with_right_successors_keeps_every_row() {
 #[test]
 fn d4rl_with_rebuilt_successors_is_read_as_if_they_were_absent() {
     let dir = tempfile::tempdir().unwrap();
-    let mut r = rows(10);
-    r.terminals[3] = true;
-    r.timeouts[6] = true;
+    let mut r = rebuilt(&[40, 30, 30]);
+    r.terminals[39] = true;
+    r.timeouts[69] = true;
     let with = load(&write(&dir, "a.hdf5", r.with_next(r.d4rl()))).unwrap();
     let without = load(&write(&dir, "b.hdf5", r.d4rl())).unwrap();
     assert_eq!(with.transitions, without.transitions);
     assert!(with.report.to_string().contains("treated as absent"));
+    assert_eq!(with.report.successors, Successors::NextRow);
 }
 
 #[test]

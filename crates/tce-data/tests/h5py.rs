@@ -67,7 +67,8 @@ with h5py.File(sys.argv[1], "w") as f:
     let got = load(&path, &LoadOptions::default()).unwrap();
     assert_eq!((got.report.dropped.time_out, got.report.dropped.last_row, got.report.rows_kept), (3, 1, 3996));
     assert_eq!(got.transitions.observation(1), [3.0, 4.0, 5.0]);
-    assert_eq!(got.transitions.next_observation(1233), [3705.0, 3706.0, 3707.0]);
+    assert_eq!(got.transitions.next_observation(1232), [3702.0, 3703.0, 3704.0]);
+    assert!(!got.transitions.known[1233], "the next row is another episode's first");
     // Row 999 of the file is gone: row 1234 is row 1233 here.
     assert_eq!(got.transitions.terminals.iter().position(|&t| t), Some(1233));
     assert_eq!(tce_data::read_attributes(&path).unwrap()["who"], "h5py");

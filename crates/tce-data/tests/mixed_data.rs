@@ -17,7 +17,7 @@ fn pairs() -> Vec<(String, Transitions, Transitions)> {
     };
     let read = |agent: Agent, shift: Shift, quality: &str| {
         let path = shared.join(format!("datasets/otdf/{agent}_{}_{quality}.hdf5", shift.file_name()));
-        load(&path, &LoadOptions { dims: Some(agent.dims()), ..LoadOptions::default() }).unwrap().transitions
+        load(&path, &LoadOptions { dims: Some(agent.dims()), ..common::benchmark() }).unwrap().transitions
     };
     let of = |agent, shift: Shift| {
         (format!("{agent} {}", shift.file_name()), read(agent, shift, "medium"), read(agent, shift, "expert"))

@@ -42,7 +42,7 @@ fn speed_of_files() {
     eprintln!("file: {} MB", std::fs::metadata(&path).unwrap().len() >> 20);
     let got = seconds("load", || load(&path, &LoadOptions::default()).unwrap());
     assert!(got.transitions == t);
-    seconds("inspect", || inspect(&t, 1000));
+    seconds("inspect", || inspect(&t, Some(1000)));
     seconds("check", || check(&t, None));
     seconds("standardise", || Standardizer::fit(&t.observations, 17).apply(&t.observations));
     seconds("z-score", || zscore_keep(&Rows::state_pairs(&t), 3.0));

@@ -3,10 +3,10 @@
 mod common;
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
+use std::process::Command;
 
-use common::synthetic;
+use common::{environment, synthetic};
 use tce_data::save_d4rl;
 
 /// Name of the environment, the library inside, and what pip installs. The oldest and the newest h5py that Python 3.11
@@ -37,44 +37,6 @@ for n in map(int, rows):
 print(h5py.version.hdf5_version)
 "#;
 
-/// The Python of a virtual environment under `target/`, made when missing; `Err` says why there is none.
-///
-/// Made beside its place and moved there whole, so that test processes that run side by side cannot see half of one.
-fn environment(name: &str, packages: [&str; 2]) -> Result<PathBuf, String> {
-    let root = Path::new(env!("CARGO_TARGET_TMPDIR"));
-    let place = root.join(name);
-    let python = |folder: &Path| folder.join("bin/python");
-    let works = |folder: &Path| {
-        Command::new(python(folder)).args(["-c", "import h5py, numpy"]).output().is_ok_and(|o| o.status.success())
-    };
-    if works(&place) {
-        return Ok(python(&place));
-    }
-    let run = |command: &mut Command| -> Result<(), String> {
-        let Output { status, stderr, .. } = command.output().map_err(|e| format!("{command:?}: {e}"))?;
-        let why = String::from_utf8_lossy(&stderr);
-        let last = why.lines().rfind(|l| !l.trim().is_empty()).unwrap_or("").to_owned();
-        if status.success() { Ok(()) } else { Err(format!("{command:?}: {last}")) }
-    };
-    fs::create_dir_all(root).map_err(|e| e.to_string())?;
-    let making = tempfile::Builder::new().prefix(name).tempdir_in(root).map_err(|e| e.to_string())?;
-    let base = std::env::var("TCE_PYTHON").unwrap_or_else(|_| "python3".into());
-    run(Command::new(base).args(["-m", "venv"]).arg(making.path()))?;
-    // Wheels only: building h5py from source takes minutes and HDF5's headers.
-    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"];
-    let patience = ["--retries", "1", "--timeout", "15"];
-    run(Command::new(python(making.path())).args(pip).args(patience).args(packages))?;
-    if !works(making.path()) {
-        return Err(format!("{name} was installed, and cannot be imported"));
-    }
-    // Another process may have been faster, or one that does not work is in the way.
-    if fs::rename(making.path(), &place).is_err() && !works(&place) {
-        fs::remove_dir_all(&place).map_err(|e| e.to_string())?;
-        fs::rename(making.path(), &place).map_err(|e| e.to_string())?;
-    }
-    Ok(python(&place))
-}
-
 fn write_all(folder: &Path) {
     for n in ROWS {
         let t = synthetic(n, 11, 3, 7);
@@ -101,7 +63,7 @@ fn old_and_new_libraries_read_our_files() {
         for (name, library, packages) in VERSIONS {
             let folder = dir.path();
             s.spawn(move || {
-                let python = match environment(name, packages) {
+                let python = match environment(name, &packages, "h5py, numpy") {
                     Ok(python) => python,
                     Err(why) => return eprintln!("SKIPPED: no {name}: {why}"),
                 };

@@ -93,7 +93,7 @@ pub fn load_npz(path: &Path) -> Result<Policy, LearnError> {
         weights.tensors.insert(format!("policy.layers.{k}.bias"), (vec![1, 1, b.len()], b));
         weights.tensors.insert(format!("policy.layers.{k}.weight"), (vec![1, w.columns, w.rows], w.transposed()));
     }
-    Ok(Policy::Mlp(Box::new(MlpPolicy::new(spec, &weights, "policy", path)?)))
+    Ok(MlpPolicy::new(spec, &weights, "policy", path)?.into())
 }
 
 /// A matrix `[rows, columns]`, row-major.

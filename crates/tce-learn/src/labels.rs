@@ -2,7 +2,7 @@
 //!
 //! | question | answer |
 //! |---|---|
-//! | Which data? | the target's rows, less a share held out to measure the error |
+//! | Which data? | the target's rows, less a share held out to measure the error; for terminals the source's rows, too |
 //! | Which networks? | two or three [`PairModel`]s (Table B.1), trained together, one thread each where there are two |
 //! | Actions outside the box? | clipped to [-1, 1]; the share of such components is reported (about 6 %) |
 //! | Terminals? | the paper says nothing: [`TerminalHandling`] |
@@ -97,18 +97,21 @@ pub struct LabelModels {
     action: PairModel,
     reward: PairModel,
     terminal: Option<PairModel>,
+    /// What the classifier learns from, where that is more than the target's rows.
+    both: Option<Buffer>,
     device: Device,
 }
 
 impl LabelModels {
     /// Untrained models for the target part of each member. States are standardised by the member's target rows,
-    /// whatever standardiser the member's policy uses.
+    /// whatever standardiser the member's policy uses. The classifier of terminals learns from all parts, half a batch of each: which
+    /// states end an episode is a rule that both domains share.
     ///
     /// # Errors
     /// If the configuration or the data cannot be used.
     pub fn new(members: &[Member], config: &LabelConfig, device: &Device) -> Result<Self, LearnError> {
         within("held_out", config.held_out, 0.0..=0.5)?;
-        let (mut training, mut held_out) = (Vec::new(), Vec::new());
+        let (mut training, mut held_out, mut with_source) = (Vec::new(), Vec::new(), Vec::new());
         for member in members {
             let Some(target) = member.parts.first() else {
                 return Err(LearnError::invalid("members", "no parts", "target rows", "give the target data"));
@@ -118,13 +121,17 @@ impl LabelModels {
             let keep = target.len() - (target.len() as f64 * config.held_out) as usize;
             let (train, held) = rows.split_at(keep);
             held_out.push(target.select(held));
-            training.push(Member {
+            let own = Member {
                 streams: member.streams,
                 standardizer: Standardizer::fit(&target.observations, target.obs_dim),
                 parts: vec![Arc::new(target.select(train))],
                 reward_scale: 1.0,
                 row_scores: None,
-            });
+            };
+            if let Some(source) = member.parts.get(1) {
+                with_source.push(Member { parts: vec![own.parts[0].clone(), source.clone()], ..own.clone() });
+            }
+            training.push(own);
         }
         let buffer = Buffer::new(training, config.batch)?.with_stream("label batch");
         let model = |target| PairModel::new(target, &buffer, &config.model, config.steps, device);
@@ -132,6 +139,10 @@ impl LabelModels {
             action: model(PairTarget::Action)?,
             reward: model(PairTarget::Reward)?,
             terminal: config.learn_terminals.then(|| model(PairTarget::Terminal)).transpose()?,
+            both: match config.learn_terminals && with_source.len() == members.len() {
+                true => Some(Buffer::new(with_source, config.batch)?.with_stream("terminal batch")),
+                false => None,
+            },
             device: device.clone(),
             buffer,
             held_out,
@@ -226,6 +237,7 @@ impl LabelModels {
                     rewards: rewards[m].clone(),
                     next_observations: s2.clone(),
                     timeouts: terminals.iter().map(|t| !t).collect(),
+                    known: vec![true; rows],
                     terminals,
                 },
             }
@@ -236,11 +248,17 @@ impl LabelModels {
 
 impl Learner for LabelModels {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { action, reward, terminal, .. } = self;
+        let Self { action, reward, terminal, both, device, .. } = self;
+        let own = both.as_ref().map(|buffer| buffer.sample(step, device));
         // Small batches feed one thread only: the models are trained side by side.
         let (action, (reward, terminal)) = rayon::join(
             || action.update(batch, step),
-            || (reward.update(batch, step), terminal.as_mut().map(|model| model.update(batch, step))),
+            || {
+                (
+                    reward.update(batch, step),
+                    terminal.as_mut().map(|model| model.update(own.as_ref().unwrap_or(batch), step)),
+                )
+            },
         );
         meter.record("action_loss", &action);
         meter.record("reward_loss", &reward);

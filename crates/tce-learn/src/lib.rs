@@ -73,7 +73,7 @@ pub use meta_dt::{MetaDt, MetaDtConfig};
 pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;
 pub use otdf::{Otdf, OtdfConfig};
-pub use policy::{Memory, Policy};
+pub use policy::{Memory, Policy, PolicyKind};
 pub use rebrac::{Rebrac, RebracConfig};
 pub use regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 pub use sequence_policy::{SequencePolicy, SequenceSpec};

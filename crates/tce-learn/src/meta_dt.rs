@@ -283,8 +283,7 @@ impl PolicyLearner for MetaDt {
                 return_scale: c.return_scale,
                 first_return: c.return_factor * trajectories.best_target_return(),
             };
-            let policy = SequencePolicy::of(spec, encoder, nets.transformer.net());
-            Policy::Sequence(Box::new(policy))
+            SequencePolicy::of(spec, encoder, nets.transformer.net()).into()
         };
         self.members.iter().zip(buffer.members()).enumerate().map(policy).collect()
     }
@@ -293,6 +292,7 @@ impl PolicyLearner for MetaDt {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::PolicyKind;
     use std::sync::Arc;
     use tce_base::random::fill_normal;
     use tce_data::{Standardizer, Transitions};
@@ -331,7 +331,7 @@ mod tests {
         let mut policy = learner.policies().remove(0);
         let mut errors = Vec::new();
         for episode in t.episodes() {
-            let Policy::Sequence(sequence) = &mut policy else { panic!("a policy with a memory") };
+            let PolicyKind::Sequence(sequence) = policy.kind_mut() else { panic!("a policy with a memory") };
             // What the data got in this episode is what the policy is asked for.
             let mut memory = sequence.asked(episode.episode_return).start();
             let mut a = [0.0; 2];

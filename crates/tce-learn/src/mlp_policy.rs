@@ -241,13 +241,14 @@ pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -
     let mut all = NamedParameters::default();
     all.collect(KEY, networks);
     let policy = |(m, spec)| MlpPolicy::new(spec, &all.member(m), KEY, Path::new("(in memory)"));
-    let made = |x| Policy::Mlp(Box::new(policy(x).expect("the networks were made from the specification")));
+    let made = |x| Policy::from(policy(x).expect("the networks were made from the specification"));
     specs.into_iter().enumerate().map(made).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::PolicyKind;
 
     fn spec(head: Head) -> PolicySpec {
         PolicySpec {
@@ -267,13 +268,15 @@ mod tests {
         }
     }
 
+    fn alone(policy: &Policy) -> MlpPolicy {
+        let PolicyKind::Mlp(policy) = policy.kind() else { panic!("{policy:?}") };
+        (**policy).clone()
+    }
+
     fn policy(head: Head) -> MlpPolicy {
         let spec = spec(head);
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
-        match from_population(vec![spec], &network).remove(0) {
-            Policy::Mlp(policy) => *policy,
-            other => panic!("{other:?}"),
-        }
+        alone(&from_population(vec![spec], &network).remove(0))
     }
 
     #[test]
@@ -281,10 +284,7 @@ mod tests {
         let tanh = PolicySpec { output_activation: Activation::Tanh, hidden: vec![16, 8], ..spec(Head::Mean) };
         let policies = [5, 6, 7].map(|seed| {
             let network = tanh.network().init(&[Streams::new(seed)], "policy", &cpu());
-            match from_population(vec![tanh.clone()], &network).remove(0) {
-                Policy::Mlp(policy) => *policy,
-                other => panic!("{other:?}"),
-            }
+            alone(&from_population(vec![tanh.clone()], &network).remove(0))
         });
         let average = MlpPolicy::average(&policies.iter().collect::<Vec<_>>());
         assert_eq!(average.spec().hidden, [48, 24]);

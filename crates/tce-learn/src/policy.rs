@@ -8,22 +8,47 @@
 //! Whoever rolls a policy out keeps one [`Memory`] per lane: made at an episode's start by [`Policy::start`], given to
 //! [`Policy::act_with`] beside the observation, told the reward by [`Policy::reward`] after the step.
 
+use std::io::Read;
 use std::path::Path;
 
 use tce_base::Rng;
+use tce_data::ActionRange;
 use tce_nn::NamedParameters;
 
 use crate::error::LearnError;
 use crate::mlp_policy::MlpPolicy;
 use crate::sequence_policy::{self, Recall, SequencePolicy};
 
+/// Key of the range of the actions in a policy file's metadata.
+const RANGE: &str = "action_range";
+
 /// One policy, ready to act.
 #[derive(Clone, Debug)]
-pub enum Policy {
+pub struct Policy {
+    kind: PolicyKind,
+    /// The user's units, where they are not the box [-1, 1].
+    range: Option<ActionRange>,
+}
+
+/// How a policy comes to its actions.
+#[derive(Clone, Debug)]
+pub enum PolicyKind {
     /// From the observation alone.
     Mlp(Box<MlpPolicy>),
     /// From the last steps.
     Sequence(Box<SequencePolicy>),
+}
+
+impl From<MlpPolicy> for Policy {
+    fn from(policy: MlpPolicy) -> Self {
+        Self { kind: PolicyKind::Mlp(Box::new(policy)), range: None }
+    }
+}
+
+impl From<SequencePolicy> for Policy {
+    fn from(policy: SequencePolicy) -> Self {
+        Self { kind: PolicyKind::Sequence(Box::new(policy)), range: None }
+    }
 }
 
 /// What a lane remembers of its episode; empty, and without memory of the heap, for a policy that remembers nothing.
@@ -39,6 +64,15 @@ impl Policy {
         if path.extension().is_some_and(|e| e == "npz") {
             return crate::import::load_npz(path);
         }
+        if let Some(found) = other_format(path) {
+            return Err(LearnError::Policy {
+                path: path.to_owned(),
+                field: "file".into(),
+                found: found.into(),
+                expected: "a policy: .safetensors as `tce learn` writes it, or .npz of plain arrays".into(),
+                remedy: "for another program's network, write its weights with numpy.savez under the names in the documentation of tce_learn::import".into(),
+            });
+        }
         Self::from_parameters(&NamedParameters::load(path)?, path)
     }
 
@@ -47,19 +81,54 @@ impl Policy {
     /// # Errors
     /// If it is not a policy.
     pub fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
-        match parameters.metadata.contains_key(sequence_policy::KEY) {
-            true => SequencePolicy::from_parameters(parameters, path).map(|p| Self::Sequence(Box::new(p))),
-            false => MlpPolicy::from_parameters(parameters, path).map(|p| Self::Mlp(Box::new(p))),
-        }
+        let policy: Self = match parameters.metadata.contains_key(sequence_policy::KEY) {
+            true => SequencePolicy::from_parameters(parameters, path)?.into(),
+            false => MlpPolicy::from_parameters(parameters, path)?.into(),
+        };
+        let Some(text) = parameters.metadata.get(RANGE) else { return Ok(policy) };
+        let range = serde_json::from_str::<ActionRange>(text).ok().filter(|r| r.fits(policy.dims().1));
+        let range = range.ok_or_else(|| LearnError::Policy {
+            path: path.to_owned(),
+            field: RANGE.into(),
+            found: text.chars().take(200).collect(),
+            expected: format!("`low` and `high` of {} actions, each low below its high", policy.dims().1),
+            remedy: "the file contradicts itself: write it anew".into(),
+        })?;
+        Ok(policy.in_units(Some(range)))
+    }
+
+    /// The same policy with actions in the user's units: what it learned as -1 and 1 becomes `low` and `high`.
+    pub fn in_units(self, range: Option<ActionRange>) -> Self {
+        Self { range, ..self }
+    }
+
+    /// The user's units; None: the box [-1, 1].
+    pub fn action_range(&self) -> Option<&ActionRange> {
+        self.range.as_ref()
+    }
+
+    /// How it comes to its actions.
+    pub fn kind(&self) -> &PolicyKind {
+        &self.kind
+    }
+
+    /// [`Self::kind`], to change it.
+    #[cfg(test)]
+    pub(crate) fn kind_mut(&mut self) -> &mut PolicyKind {
+        &mut self.kind
     }
 
     /// The weights and, in the metadata, what kind of policy it is and its specification. Callers may add metadata of their own
     /// before saving.
     pub fn to_parameters(&self) -> NamedParameters {
-        match self {
-            Self::Mlp(policy) => policy.to_parameters(),
-            Self::Sequence(policy) => policy.to_parameters(),
+        let mut out = match &self.kind {
+            PolicyKind::Mlp(policy) => policy.to_parameters(),
+            PolicyKind::Sequence(policy) => policy.to_parameters(),
+        };
+        if let Some(range) = &self.range {
+            out.metadata.insert(RANGE.into(), serde_json::to_string(range).expect("plain numbers"));
         }
+        out
     }
 
     /// Writes a safetensors file, whole or not at all.
@@ -78,31 +147,33 @@ impl Policy {
     pub fn average(policies: &[&Self]) -> Self {
         let networks: Option<Vec<&MlpPolicy>> = policies.iter().map(|p| p.as_mlp()).collect();
         match networks {
-            Some(networks) if networks.len() > 1 => Self::Mlp(Box::new(MlpPolicy::average(&networks))),
+            Some(networks) if networks.len() > 1 => {
+                Self::from(MlpPolicy::average(&networks)).in_units(policies[0].range.clone())
+            }
             _ => policies[0].clone(),
         }
     }
 
     fn as_mlp(&self) -> Option<&MlpPolicy> {
-        match self {
-            Self::Mlp(policy) => Some(policy),
-            Self::Sequence(_) => None,
+        match &self.kind {
+            PolicyKind::Mlp(policy) => Some(policy),
+            PolicyKind::Sequence(_) => None,
         }
     }
 
     /// Lengths of an observation and of an action.
     pub fn dims(&self) -> (usize, usize) {
-        match self {
-            Self::Mlp(policy) => (policy.spec().observations, policy.spec().actions),
-            Self::Sequence(policy) => (policy.spec().observations, policy.spec().actions),
+        match &self.kind {
+            PolicyKind::Mlp(policy) => (policy.spec().observations, policy.spec().actions),
+            PolicyKind::Sequence(policy) => (policy.spec().observations, policy.spec().actions),
         }
     }
 
     /// The memory of a lane whose episode begins.
     pub fn start(&self) -> Memory {
-        match self {
-            Self::Mlp(_) => Memory::default(),
-            Self::Sequence(policy) => Memory(Some(Box::new(policy.start()))),
+        match &self.kind {
+            PolicyKind::Mlp(_) => Memory::default(),
+            PolicyKind::Sequence(policy) => Memory(Some(Box::new(policy.start()))),
         }
     }
 
@@ -119,12 +190,16 @@ impl Policy {
         rngs: Option<&mut [Rng]>,
         actions: &mut [f32],
     ) {
-        match self {
-            Self::Mlp(policy) => policy.act(observations, rngs, actions),
-            Self::Sequence(policy) => {
+        match &self.kind {
+            PolicyKind::Mlp(policy) => policy.act(observations, rngs, actions),
+            PolicyKind::Sequence(policy) => {
+                // What it remembers of its actions are those of the box.
                 let recalls = memories.iter_mut().map(|m| m.0.as_deref_mut().expect("a memory of this policy"));
                 policy.act(observations, &mut recalls.collect::<Vec<_>>(), actions);
             }
+        }
+        if let Some(range) = &self.range {
+            range.to_own(actions);
         }
     }
 
@@ -142,6 +217,22 @@ impl Policy {
         if let Some(recall) = &mut memory.0 {
             recall.reward(reward);
         }
+    }
+}
+
+/// What a file is that begins like one of another format; None for what may be safetensors, or cannot be read.
+fn other_format(path: &Path) -> Option<&'static str> {
+    let mut start = Vec::new();
+    std::fs::File::open(path).ok()?.take(10).read_to_end(&mut start).ok()?;
+    match start.as_slice() {
+        [b'P', b'K', 3, 4, ..] => Some("a zip archive, such as a PyTorch checkpoint (.pt), or an .npz of another name"),
+        // Protocol 2 to 5; a length of safetensors has six zero bytes behind the first two.
+        [0x80, 2..=5, rest @ ..] if rest.get(..6) != Some(&[0; 6]) => {
+            Some("a Python pickle, such as an old PyTorch checkpoint")
+        }
+        [0x89, b'H', b'D', b'F', ..] => Some("an HDF5 file: a data set, or Keras weights"),
+        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Some("a single NumPy array (.npy)"),
+        _ => None,
     }
 }
 
@@ -185,6 +276,24 @@ mod tests {
     }
 
     #[test]
+    fn actions_are_in_the_users_units() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("policy.safetensors");
+        let range = ActionRange { low: vec![-20.0, 0.0], high: vec![20.0, 10.0] };
+        policy().in_units(Some(range.clone())).save(&path).unwrap();
+        let loaded = Policy::load(&path).unwrap();
+        assert_eq!(loaded.action_range(), Some(&range));
+        let (mut unit, mut own) = (vec![0.0; 2], vec![0.0; 2]);
+        policy().act(&[0.1, -0.2, 0.3], None, &mut unit);
+        loaded.act(&[0.1, -0.2, 0.3], None, &mut own);
+        assert_eq!(own, [20.0 * unit[0], 5.0 * (unit[1] + 1.0)]);
+        let mut parameters = loaded.to_parameters();
+        parameters.metadata.insert(RANGE.into(), "{\"low\":[1,1],\"high\":[1,2]}".into());
+        let error = Policy::from_parameters(&parameters, &path).unwrap_err().to_string();
+        assert!(error.contains("action_range") && error.contains("each low below its high"), "{error}");
+    }
+
+    #[test]
     fn what_is_not_a_policy_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("policy.safetensors");
@@ -195,6 +304,22 @@ mod tests {
         parameters.metadata.insert(KEY.into(), json);
         parameters.save(&path).unwrap();
         assert!(Policy::load(&path).unwrap_err().to_string().contains("dimensions below 3"));
+    }
+
+    #[test]
+    fn files_of_other_programs_are_told_what_they_are() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("model.pt");
+        for (start, what) in [
+            (&b"PK\x03\x04rest of an archive"[..], "PyTorch checkpoint"),
+            (b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j", "Python pickle"),
+            (b"\x89HDF\r\n\x1a\n....", "an HDF5 file"),
+            (b"\x93NUMPY\x01\x00", "a single NumPy array"),
+        ] {
+            std::fs::write(&path, start).unwrap();
+            let error = Policy::load(&path).unwrap_err().to_string();
+            assert!(error.contains(what) && error.contains("expected a policy"), "{error}");
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use npyz::npz::NpzWriter;
 use npyz::{DType, Order, WriterBuilder};
 use tce_base::{Rng, Streams, random::fill_normal};
-use tce_learn::{Head, Policy};
+use tce_learn::{Head, Policy, PolicyKind};
 
 /// One array of a file: name, shape, row-major values.
 type Array = (&'static str, Vec<u64>, Vec<f64>);
@@ -180,7 +180,7 @@ fn every_shared_policy_loads_and_acts_in_the_box() {
     let mut kinds = [0; 3];
     for path in files.map(|f| f.unwrap().path()).filter(|p| p.extension().is_some_and(|e| e == "npz")) {
         let policy = Policy::load(&path).unwrap_or_else(|e| panic!("{e}"));
-        let Policy::Mlp(mlp) = &policy else { panic!("{}", path.display()) };
+        let PolicyKind::Mlp(mlp) = policy.kind() else { panic!("{}", path.display()) };
         let spec = mlp.spec();
         kinds[match spec.head {
             Head::Mean => 0,

@@ -74,6 +74,20 @@ fn labels_follow_the_laws_of_the_system() {
     assert!(models.label(&generated[..1], TerminalHandling::None).is_err());
 }
 
+/// Where the target's rows never end an episode, the source's tell which states do.
+#[test]
+fn terminals_are_learned_from_both_domains() {
+    let source = data(2000);
+    let inside: Vec<usize> = (0..2000).filter(|&i| !source.terminals[i]).collect();
+    let target = Arc::new(source.select(&inside));
+    let members: Vec<Member> =
+        members(&[1]).into_iter().map(|m| Member { parts: vec![target.clone(), source.clone()], ..m }).collect();
+    let models = train_labels(&members, &config(PairInput::Delta), &mut Checkpoints::none(), &cpu()).unwrap().unwrap();
+    let pairs = (vec![2.5, 0.0, 1.0, -1.0, 0.0, 1.0], vec![2.5, 0.01, 1.0, -1.0, 0.01, 1.0]);
+    let labelled = models.label(&[pairs], TerminalHandling::Learned).unwrap();
+    assert_eq!(labelled[0].transitions.terminals, [true, false]);
+}
+
 #[test]
 fn differences_carry_what_successors_hide() {
     let error = |input| {

@@ -55,15 +55,16 @@ pub fn label_models(
         seeds: &'a [u64],
         labels: &'a LabelConfig,
     }
-    let by_rule = config.terminal == Terminal::Rule && inputs.agent.is_some();
-    let learn_terminals = config.terminal != Terminal::None && !by_rule;
+    let learn_terminals = terminals(inputs, config) == Terminal::Learned;
     let labels = LabelConfig { learn_terminals, ..config.training.clone() };
-    let stage =
-        Stage::open(root, "stages/labels", &Spec { inputs: inputs.spec(false), seeds, labels: &labels }, device)?;
+    let spec = Spec { inputs: inputs.spec(learn_terminals), seeds, labels: &labels };
+    let stage = Stage::open(root, "stages/labels", &spec, device)?;
     let target = Arc::new(inputs.target.rows.clone());
+    let mut parts = vec![target.clone()];
+    parts.extend(inputs.source.iter().filter(|_| learn_terminals).map(|s| Arc::new(s.rows.clone())));
     let member = |&seed: &u64| Member {
         streams: Streams::new(seed),
-        parts: vec![target.clone()],
+        parts: parts.clone(),
         standardizer: Standardizer::identity(target.obs_dim),
         reward_scale: 1.0,
         row_scores: None,
@@ -85,6 +86,17 @@ pub fn label_models(
     Ok((models, stage, errors))
 }
 
+/// Where terminal flags of generated rows come from, for these files: a benchmark robot's rule only where the user named the robot, a
+/// classifier only where a row of either file is terminal.
+fn terminals(inputs: &Inputs, config: &LabelsConfig) -> Terminal {
+    let any = || std::iter::once(&inputs.target).chain(&inputs.source).any(|t| t.rows.terminals.contains(&true));
+    match config.terminal {
+        Terminal::Rule if inputs.agent.is_some() => Terminal::Rule,
+        Terminal::Rule | Terminal::Learned if any() => Terminal::Learned,
+        _ => Terminal::None,
+    }
+}
+
 /// Filters and labels state pairs of live dimensions.
 pub struct Finisher<'a> {
     /// The units of the pairs.
@@ -102,10 +114,11 @@ pub struct Finisher<'a> {
 impl<'a> Finisher<'a> {
     /// What `config` says about filter and terminals, for the data of `inputs`.
     pub fn new(units: &'a Units, models: &'a LabelModels, config: &'a Config, inputs: &Inputs) -> Self {
-        Self { units, models, filter: &config.filter, terminal: config.labels.terminal, agent: inputs.agent }
+        Self { units, models, filter: &config.filter, terminal: terminals(inputs, &config.labels), agent: inputs.agent }
     }
 
-    /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite never do.
+    /// Which pairs `[rows, d]` pass the filter; pairs that hold a number that is not finite, and those that begin in a state that a
+    /// known rule calls terminal, never do.
     pub(crate) fn keep(&self, states: &[f32], successors: &[f32]) -> Vec<bool> {
         let d = self.units.live.len();
         let finite = states
@@ -113,6 +126,12 @@ impl<'a> Finisher<'a> {
             .zip(successors.chunks_exact(d))
             .map(|(s, s2)| s.iter().chain(s2).all(|v| v.is_finite()));
         let mut keep: Vec<bool> = finite.collect();
+        if let (Terminal::Rule, Some(agent)) = (self.terminal, self.agent) {
+            // No episode goes on from a state that has ended it.
+            let whole = self.units.put_back(states);
+            let states = whole.chunks_exact(whole.len() / keep.len().max(1));
+            keep.iter_mut().zip(states).for_each(|(keep, s)| *keep = *keep && !terminal_rule(agent, s));
+        }
         if self.filter.enabled && self.filter.by == FilterKind::Zscore {
             let (states, successors) = (choose(states, d, &keep), choose(successors, d, &keep));
             let pairs = Rows::join(&[(&states, d), (&successors, d)]);

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use hdf5_pure::FileBuilder;
 use rand::RngExt;
 use tce_base::{Rng, Streams, write_sealed};
 use tce_data::{LoadOptions, Standardizer, Transitions, load};
@@ -129,11 +130,48 @@ fn fuzz(name: &str, seeds: Vec<Vec<u8>>, ratio: usize, read: impl Fn(&[u8], &Pat
 #[test]
 fn fuzz_hdf5() {
     // Deflate makes up to 1032 bytes of one, and rows are kept as they are read and as they are used.
-    fuzz("hdf5", seeds(&["d4rl-gzip.hdf5", "otdf-plain.hdf5", "latest.hdf5"]), 300, |_, path| {
-        if let Ok(loaded) = load(path, &LoadOptions::default()) {
-            let _ = tce_data::inspect(&loaded.transitions, 1000);
+    let mut all = seeds(&["d4rl-gzip.hdf5", "otdf-plain.hdf5", "latest.hdf5"]);
+    all.extend([minari_episodes(), robomimic_demonstrations()]);
+    fuzz("hdf5", all, 300, |_, path| {
+        if let Ok(loaded) = load(path, &LoadOptions { all_columns: true, ..LoadOptions::default() }) {
+            let _ = tce_data::inspect(&loaded.transitions, Some(1000));
         }
     });
+}
+
+/// Two episodes in Minari's layout, with a state of two arrays.
+fn minari_episodes() -> Vec<u8> {
+    let mut file = FileBuilder::new();
+    for (name, n) in [("episode_0", 5usize), ("episode_1", 3)] {
+        let mut episode = file.create_group(name);
+        let mut state = episode.create_group("observations");
+        state.create_dataset("a").with_f32_data(&vec![0.5; 2 * (n + 1)]).with_shape(&[n as u64 + 1, 2]);
+        state.create_dataset("b").with_f64_data(&vec![0.25; n + 1]);
+        episode.add_group(state.finish());
+        episode.create_dataset("actions").with_f32_data(&vec![0.1; n]).with_shape(&[n as u64, 1]);
+        episode.create_dataset("rewards").with_f64_data(&vec![1.0; n]);
+        episode.create_dataset("terminations").with_u8_data(&vec![0; n]);
+        episode.create_dataset("truncations").with_u8_data(&vec![0; n]);
+        file.add_group(episode.finish());
+    }
+    file.finish().expect("a small file")
+}
+
+/// Two demonstrations in robomimic's layout, without `next_obs`.
+fn robomimic_demonstrations() -> Vec<u8> {
+    let mut file = FileBuilder::new();
+    let mut data = file.create_group("data");
+    for name in ["demo_0", "demo_1"] {
+        let mut demo = data.create_group(name);
+        let mut state = demo.create_group("obs");
+        state.create_dataset("joint").with_f32_data(&[0.5; 8]).with_shape(&[4, 2]);
+        demo.add_group(state.finish());
+        demo.create_dataset("actions").with_f32_data(&[0.1; 4]).with_shape(&[4, 1]);
+        demo.create_dataset("dones").with_u8_data(&[0, 0, 0, 1]);
+        data.add_group(demo.finish());
+    }
+    file.add_group(data.finish());
+    file.finish().expect("a small file")
 }
 
 #[test]

@@ -6,16 +6,20 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use tce_base::sha256_file;
 use tce_data::{
-    Agent, Choice, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Task, Transitions,
-    choose_trajectories, ensure_same_agent, infer_agents, load, reference_scores,
+    ActionRange, Agent, Choice, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Standardizer, Task,
+    Transitions, choose_trajectories, ensure_same_agent, infer_agents, load, main_file, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
 
 use crate::actors::{Cast, Recipe};
-use crate::config::{Config, TargetConfig, Trajectories};
+use crate::config::{Algorithm, Config, LearnerConfig, TargetConfig, Trajectories};
 use crate::error::{Error, Result};
+use crate::own::{Own, range_of};
 use crate::stand_ins::{self, shared_folder};
 use crate::zoo;
+
+/// Below this, nothing can be held out and nothing be learned.
+const LEAST_ROWS: usize = 10;
 
 /// The files of a benchmark task, and where results go.
 #[derive(Clone, Debug, clap::Args)]
@@ -45,13 +49,23 @@ pub struct Inputs {
     pub target: Table,
     /// Source rows; variants that do not look at them can do without.
     pub source: Option<Table>,
+    /// Rows of a third file, to learn from.
+    pub extra: Option<Table>,
+    /// The units of the files' actions, where they are not the box [-1, 1]. The tables are in the box.
+    pub actions: Option<ActionRange>,
+    /// The collector's step limit, where the user gave one.
+    limit: Option<usize>,
 }
 
 /// A loaded file.
 #[derive(Debug)]
 pub struct Table {
-    /// The rows.
+    /// The rows whose successor is known.
     pub rows: Transitions,
+    /// All rows, where there are terminal ones without a successor among them.
+    complete: Option<Transitions>,
+    /// All rows' actions as the file has them, where they were scaled.
+    own_actions: Option<Vec<f32>>,
     /// The file.
     pub file: PathBuf,
     /// SHA-256 of the file, and how many of its rows these are, if not all.
@@ -76,8 +90,58 @@ pub struct Behaviour {
 }
 
 impl Table {
-    fn behaviour(&self, reference: Option<ReferenceScores>) -> Behaviour {
-        let content = tce_data::inspect(&self.rows, EPISODE_LIMIT);
+    fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
+        let Loaded { transitions, report, .. } = load(path, options)?;
+        eprintln!("{report}");
+        Ok(Self::new(transitions, path, sha256_file(&main_file(path))?))
+    }
+
+    fn new(rows: Transitions, file: &Path, hash: String) -> Self {
+        let (rows, complete) = match rows.with_successors() {
+            Cow::Borrowed(_) => (rows, None),
+            Cow::Owned(known) => (known, Some(rows)),
+        };
+        Self { rows, complete, own_actions: None, file: file.to_owned(), hash }
+    }
+
+    /// Refuses rows of which nothing can be learned.
+    fn usable(&self) -> Result<()> {
+        let refuse = |found: String, expected: &str| {
+            let file = self.file.display();
+            Err(Error::Failed(format!("{file}: found {found}, expected {expected}; record more of this robot")))
+        };
+        if self.rows.len() < LEAST_ROWS {
+            return refuse(format!("{} rows with a next state", self.rows.len()), &format!("at least {LEAST_ROWS}"));
+        }
+        let varies = |values: &[f32], dim: usize| Standardizer::fit(values, dim).dead.len() < dim;
+        if !varies(&self.rows.observations, self.rows.obs_dim) {
+            return refuse("states that never change".into(), "at least one column of `observations` that does");
+        }
+        let pairs = self.rows.next_observations.iter().zip(&self.rows.observations);
+        if pairs.clone().all(|(next, state)| next == state) {
+            return refuse("next states that are the states".into(), "a robot that moves");
+        }
+        Ok(())
+    }
+
+    /// Whether rows follow each other: half of them do at least.
+    pub fn has_episodes(&self) -> bool {
+        2 * self.complete().episodes().len() <= self.complete().len()
+    }
+
+    /// All rows, for whoever learns without looking at s' where an episode ended.
+    pub fn complete(&self) -> &Transitions {
+        self.complete.as_ref().unwrap_or(&self.rows)
+    }
+
+    fn scale(&mut self, range: &ActionRange) {
+        self.own_actions = Some(self.complete().actions.clone());
+        range.to_unit(&mut self.rows.actions);
+        self.complete.iter_mut().for_each(|t| range.to_unit(&mut t.actions));
+    }
+
+    fn behaviour(&self, reference: Option<ReferenceScores>, limit: Option<usize>) -> Behaviour {
+        let content = tce_data::inspect(self.complete(), limit);
         let (returns, score) = (&content.returns, content.normalised_score(reference));
         Behaviour {
             file: self.file.clone(),
@@ -100,12 +164,11 @@ pub struct InputSpec {
     /// The rows that are imitated, where they are not all.
     #[serde(skip_serializing_if = "Option::is_none")]
     chosen: Option<String>,
-}
-
-fn table(path: &Path, dims: Option<(usize, usize)>) -> Result<Table> {
-    let Loaded { transitions, report, .. } = load(path, &LoadOptions { dims, ..LoadOptions::default() })?;
-    eprintln!("{report}");
-    Ok(Table { rows: transitions, file: path.to_owned(), hash: sha256_file(path)? })
+    /// The units of actions; they depend on all files.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    actions: Option<ActionRange>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    step_limit: Option<usize>,
 }
 
 /// The first `rows` rows, the last of which ends its episode; None where those are all (0 means all of them, too).
@@ -118,13 +181,83 @@ pub(crate) fn first_rows(t: &Transitions, rows: usize) -> Option<Transitions> {
 }
 
 impl Inputs {
-    /// A user's own two files.
-    pub fn of_files(source: Option<&Path>, target: &Path) -> Result<Self> {
-        let target = table(target, None)?;
-        let source = source.map(|s| table(s, None)).transpose()?;
-        let agents = infer_agents(&target.rows);
-        let agent = if let [agent] = agents[..] { Some(agent) } else { None };
-        Self { agent, shift: None, target, source }.checked()
+    /// A user's own files: of a robot of which only that is known that the user says.
+    pub fn of_files(source: Option<&Path>, target: &Path, extra: Option<&Path>, own: &Own) -> Result<Self> {
+        let options = own.load_options();
+        let table = |path: &Path| Table::read(path, &options);
+        let (target, source, extra) = (table(target)?, source.map(table).transpose()?, extra.map(table).transpose()?);
+        let (agent, limit) = (own.agent(), own.step_limit.map(|n| n as usize));
+        let mut inputs = Self { agent, shift: None, target, source, extra, actions: None, limit }.checked()?;
+        inputs.bring_into_the_box(own)?;
+        Ok(inputs)
+    }
+
+    /// Finds the units of the files' actions, and brings all tables into the box.
+    fn bring_into_the_box(&mut self, own: &Own) -> Result<()> {
+        let tables = [Some(&self.target), self.source.as_ref(), self.extra.as_ref()];
+        let rows: Vec<&Transitions> = tables.into_iter().flatten().map(Table::complete).collect();
+        let found = ActionRange::of(&rows);
+        if let Some(found) = found.as_ref().filter(|r| !r.fits(rows[0].act_dim)) {
+            return Err(Error::Failed(format!(
+                "{}: found actions of {found}, expected a range that float32 can hold; scale them",
+                self.target.file.display()
+            )));
+        }
+        let wild = ActionRange::with_outliers(&rows);
+        if !wild.is_empty() && own.action_range.is_none() {
+            eprintln!(
+                "warning: action columns {wild:?} have values more than ten times what 99.9 % of them are: all others become small inside. Remove \
+                 them, or give --action-range"
+            );
+        }
+        let range = match (&own.action_range, self.agent) {
+            (Some(given), _) => {
+                let range = range_of(given, rows[0].act_dim, &self.target.file).map_err(Error::Usage)?;
+                let outside: usize = rows.iter().map(|t| range.outside(&t.actions)).sum();
+                if outside > 0 {
+                    eprintln!("warning: {outside} action values lie outside of --action-range {range}");
+                }
+                Some(range)
+            }
+            // The benchmark's robots take actions in the box, and clamp others.
+            (None, Some(agent)) => {
+                if let Some(found) = &found {
+                    eprintln!("warning: actions range over {found}; {agent} clamps them to [-1, 1]");
+                }
+                None
+            }
+            (None, None) => {
+                if let Some(found) = &found {
+                    eprintln!(
+                        "actions range over {found}: scaled to [-1, 1] inside; generated rows and policies are in these units \
+                         (--action-range sets others)"
+                    );
+                }
+                found
+            }
+        };
+        self.actions = range.filter(|r| !r.is_unit());
+        if let Some(range) = &self.actions {
+            let (target, source, extra) = (&mut self.target, &mut self.source, &mut self.extra);
+            std::iter::once(target).chain(source).chain(extra).for_each(|table| table.scale(range));
+        }
+        Ok(())
+    }
+
+    /// All target rows as the file has them.
+    pub fn target_in_own_units(&self) -> Transitions {
+        let mut rows = self.target.complete().clone();
+        if let Some(own) = &self.target.own_actions {
+            rows.actions.clone_from(own);
+        }
+        rows
+    }
+
+    /// `rows` of the program in the units of the files.
+    pub fn in_own_units(&self, rows: &Transitions) -> Transitions {
+        let mut rows = rows.clone();
+        self.actions.iter().for_each(|range| range.to_own(&mut rows.actions));
+        rows
     }
 
     /// The data of a benchmark task: files where given; otherwise OTDF's public target file if the shared folder has it, and
@@ -133,10 +266,14 @@ impl Inputs {
     /// source is looked at.
     pub fn of_task(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<Self> {
         let Task { agent, shift, .. } = task;
-        let dims = Some(agent.dims());
-        let target = table(&target_file(task, args)?, dims)?;
-        let source = source_rows.map(|rows| table(&source_file(task, args, rows)?, dims)).transpose()?;
-        Self { agent: Some(agent), shift: Some(shift), target, source }.checked()
+        let own = Own { env: Some((agent, shift)), ..Own::default() };
+        let options = own.load_options();
+        let target = Table::read(&target_file(task, args)?, &options)?;
+        let source = source_rows.map(|rows| Table::read(&source_file(task, args, rows)?, &options)).transpose()?;
+        let (agent, shift) = (Some(agent), Some(shift));
+        let mut inputs = Self { agent, shift, target, source, extra: None, actions: None, limit: None }.checked()?;
+        inputs.bring_into_the_box(&own)?;
+        Ok(inputs)
     }
 
     /// [`Inputs::of_task`] as `config` wants them: without source rows if it has no use for them, with as many target rows as it says.
@@ -145,27 +282,64 @@ impl Inputs {
         Ok(Self::of_task(task, args, rows)?.with_target_rows(config.target.rows))
     }
 
-    /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
-    pub fn with_target_rows(mut self, rows: usize) -> Self {
-        if let Some(first) = first_rows(&self.target.rows, rows) {
-            self.target.rows = first;
-            self.target.hash = format!("{}, the first {rows} rows", self.target.hash);
-        }
+    /// The same with other target rows, of which `hash` tells what they are.
+    pub fn with_target(mut self, rows: Transitions, hash: String) -> Self {
+        // The first rows, in all places where actions in own units are asked for later.
+        let own_actions = self.target.own_actions.take().map(|mut own| {
+            own.truncate(rows.actions.len());
+            own
+        });
+        self.target = Table { own_actions, ..Table::new(rows, &self.target.file, hash) };
         self
+    }
+
+    /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
+    pub fn with_target_rows(self, rows: usize) -> Self {
+        let Some(first) = first_rows(self.target.complete(), rows) else { return self };
+        let hash = format!("{}, the first {rows} rows", self.target.hash);
+        self.with_target(first, hash)
     }
 
     /// The trajectories to imitate, where `config` wants the better ones and the returns show two behaviours; None: all of them.
     pub fn choice(&self, config: &TargetConfig) -> Option<Choice> {
-        let wanted = config.trajectories == Trajectories::Auto;
-        wanted.then(|| choose_trajectories(&self.target.rows)).filter(Choice::is_selective)
+        let wanted = config.trajectories == Trajectories::Auto && self.target.has_episodes();
+        wanted.then(|| choose_trajectories(self.target.complete())).filter(Choice::is_selective)
     }
 
-    /// The target rows that are imitated: by the generator, and by learners. What only has to know the dynamics (label models, learned
-    /// dynamics) takes all target rows.
-    pub fn imitated(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
+    /// Refuses target rows in no order for a learner that follows episodes.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn ensure_episodes(&self, learner: &LearnerConfig) -> Result<()> {
+        let needs = match learner.algorithm {
+            Algorithm::MetaDt => "meta-dt learns sequences",
+            _ if learner.top < 1.0 => "learner.top chooses by the returns of episodes",
+            _ => return Ok(()),
+        };
+        match self.target.has_episodes() {
+            true => Ok(()),
+            false => Err(Error::Failed(format!(
+                "{}: found rows in no order ({} episodes in {} rows), expected episodes: {needs}; record them in order, or choose another learner",
+                self.target.file.display(),
+                self.target.complete().episodes().len(),
+                self.target.complete().len()
+            ))),
+        }
+    }
+
+    /// The target rows that learners imitate. What only has to know the dynamics (label models, learned dynamics) takes all rows.
+    pub fn learned_from(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
         match self.choice(config) {
-            Some(choice) => Cow::Owned(self.target.rows.select(&choice.rows)),
-            None => Cow::Borrowed(&self.target.rows),
+            Some(choice) => Cow::Owned(self.target.complete().select(&choice.rows)),
+            None => Cow::Borrowed(self.target.complete()),
+        }
+    }
+
+    /// Those of [`Self::learned_from`] whose successor is known, which the generator imitates.
+    pub fn imitated(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
+        match self.learned_from(config) {
+            Cow::Borrowed(_) => Cow::Borrowed(&self.target.rows),
+            Cow::Owned(rows) => Cow::Owned(rows.with_successors().into_owned()),
         }
     }
 
@@ -176,8 +350,19 @@ impl Inputs {
     }
 
     fn checked(self) -> Result<Self> {
-        if let Some(source) = &self.source {
-            ensure_same_agent(&source.rows, &self.target.rows)?;
+        std::iter::once(&self.target).chain(&self.source).chain(&self.extra).try_for_each(Table::usable)?;
+        for other in self.source.iter().chain(&self.extra) {
+            ensure_same_agent(&other.rows, &self.target.rows, self.agent)?;
+            let (a, b) = (infer_agents(&other.rows), infer_agents(&self.target.rows));
+            if self.agent.is_none() && !a.is_empty() && !b.is_empty() && !a.iter().any(|x| b.contains(x)) {
+                eprintln!(
+                    "note: {} looks like {}, {} like {}; if these are robots of the benchmark, they are not the same one",
+                    other.file.display(),
+                    a[0],
+                    self.target.file.display(),
+                    b[0]
+                );
+            }
         }
         Ok(self)
     }
@@ -190,23 +375,34 @@ impl Inputs {
             target: self.target.hash.clone(),
             source: self.source.as_ref().filter(|_| with_source).map(|s| s.hash.clone()),
             chosen: None,
+            actions: self.actions.clone(),
+            step_limit: self.limit,
         }
     }
 
-    /// The source rows.
+    /// The source.
+    ///
+    /// # Errors
+    /// If the run has none.
+    pub fn source(&self) -> Result<&Table> {
+        let source = self.source.as_ref();
+        source.ok_or_else(|| Error::Usage("this configuration needs source data; give a file with --source".into()))
+    }
+
+    /// The source rows whose successor is known.
     ///
     /// # Errors
     /// If the run has none.
     pub fn source_rows(&self) -> Result<&Transitions> {
-        let source = self.source.as_ref().map(|s| &s.rows);
-        source.ok_or_else(|| Error::Usage("this configuration needs source data; give a file with --source".into()))
+        Ok(&self.source()?.rows)
     }
 
     /// How good the policies were that collected the source and the target rows.
     pub fn behaviour(&self, table: ScoreTable) -> (Option<Behaviour>, Behaviour) {
         let of_source = self.agent.and_then(|agent| reference_scores(agent, Shift::Source, table));
-        let source = self.source.as_ref().map(|s| s.behaviour(of_source));
-        (source, self.target.behaviour(self.reference(table)))
+        let limit = self.limit.or(self.agent.map(|_| EPISODE_LIMIT));
+        let source = self.source.as_ref().map(|s| s.behaviour(of_source, limit));
+        (source, self.target.behaviour(self.reference(table), limit))
     }
 
     /// The returns that stand for 0 and 100 in the target domain.
@@ -277,9 +473,10 @@ mod tests {
     fn fewer_target_rows_are_as_if_the_log_had_ended() {
         let mut t = Transitions::new(1, 1);
         (0..10).for_each(|i| t.push(&[i as f32], &[0.0], i as f32, &[i as f32 + 1.0], i == 4, i == 9));
-        let table = |rows: &Transitions| Table { rows: rows.clone(), hash: "h".into(), file: "t.hdf5".into() };
+        let table = |rows: &Transitions| Table::new(rows.clone(), Path::new("t.hdf5"), "h".into());
         let inputs = |rows: usize| {
-            let all = Inputs { agent: None, shift: None, target: table(&t), source: Some(table(&t)) };
+            let (target, source) = (table(&t), Some(table(&t)));
+            let all = Inputs { agent: None, shift: None, target, source, extra: None, actions: None, limit: None };
             all.with_target_rows(rows)
         };
         let few = inputs(7);

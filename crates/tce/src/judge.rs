@@ -18,7 +18,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_data::{NeighbourOptions, Rows, Standardizer, Transitions, nn_distances};
+use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, nn_distances};
 use tce_learn::{Domain, Dynamics, DynamicsConfig, Learner, Policy, rmse, train_dynamics};
 use tce_nn::{Device, NamedParameters};
 
@@ -48,6 +48,8 @@ pub struct Judge {
     low: Vec<f32>,
     high: Vec<f32>,
     limit: usize,
+    /// The units of the policies' actions, where they are not the box.
+    actions: Option<ActionRange>,
     spacing: f64,
 }
 
@@ -116,6 +118,7 @@ impl Judge {
             low,
             high,
             limit,
+            actions: inputs.actions.clone(),
         })
     }
 
@@ -152,6 +155,7 @@ impl Judge {
             let act_in = |(states, memories): (&Vec<f32>, &mut Vec<_>)| {
                 let mut actions = vec![0.0; lanes * act];
                 policy.act_with(states, memories, None, &mut actions);
+                self.actions.iter().for_each(|range| range.to_unit(&mut actions));
                 actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
                 actions
             };
@@ -190,6 +194,7 @@ impl Judge {
         let (mean, std) = mean_std(&returns);
         let mut actions = vec![0.0; t.actions.len()];
         policy.act(&t.observations, None, &mut actions);
+        self.actions.iter().for_each(|range| range.to_unit(&mut actions));
         Ok(Judged {
             imagined_return: mean,
             standard_error: std / n.sqrt(),

@@ -1,7 +1,7 @@
 //! From data to policies: standardisation, the learner, its metrics, and the evaluation of every member.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -18,6 +18,7 @@ use tce_sim::SimError;
 use crate::actors::{Arena, Evaluation, evaluate};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::error::{Error, Result};
+use crate::inputs::Inputs;
 use crate::methods::build;
 use crate::metrics::{Line, Metrics};
 use crate::processor::Processor;
@@ -36,6 +37,21 @@ pub struct MemberData {
     pub row_scores: Option<Arc<Vec<f32>>>,
     /// Tables with real trajectories, whose returns the reward scale is taken from.
     pub trajectories: Vec<Arc<Transitions>>,
+}
+
+/// The name of the file of the policy of a seed.
+pub fn policy_file(seed: u64) -> String {
+    format!("policy-seed{seed}.safetensors")
+}
+
+/// Writes the policies of `seeds` into `directory`, with actions in the units of `inputs`; returns the files.
+pub fn save_policies(policies: &[Policy], seeds: &[u64], directory: &Path, inputs: &Inputs) -> Result<Vec<PathBuf>> {
+    let save = |(policy, seed): (&Policy, &u64)| {
+        let file = directory.join(policy_file(*seed));
+        policy.clone().in_units(inputs.actions.clone()).save(&file)?;
+        Ok(file)
+    };
+    policies.iter().zip(seeds).map(save).collect()
 }
 
 /// What learning leaves behind besides the policies.

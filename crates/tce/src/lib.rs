@@ -20,6 +20,7 @@ mod methods;
 mod metrics;
 mod mixture;
 mod output;
+mod own;
 mod pipeline;
 mod processor;
 mod scratch;

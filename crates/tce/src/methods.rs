@@ -50,6 +50,11 @@ impl Algorithm {
         Algorithm::MetaDt,
     ];
 
+    /// Whether it looks at s' of terminal rows: it models the dynamics, or compares transitions of two domains.
+    pub fn looks_at_successors(self) -> bool {
+        !matches!(self, Algorithm::Bc | Algorithm::Iql | Algorithm::Td3Bc | Algorithm::Rebrac)
+    }
+
     /// What it is.
     pub fn method(self) -> Method {
         let any = "any rows, or none";

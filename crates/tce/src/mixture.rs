@@ -22,7 +22,7 @@ use tce_data::{
 use tce_learn::{LabelModels, TerminalHandling};
 use tce_nn::{NamedParameters, cpu};
 
-use crate::config::{MixtureConfig, SourceRows};
+use crate::config::{Config, SourceRows};
 use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::stage::Stage;
@@ -52,17 +52,22 @@ impl From<Arc<Transitions>> for Extra {
 /// source rows.
 pub fn extra_rows(
     inputs: &Inputs,
-    mixture: &MixtureConfig,
+    config: &Config,
     generated: Option<&[Extra]>,
     labels: Option<&LabelModels>,
     source_scores: Option<Arc<Vec<f32>>>,
     seeds: &[u64],
     root: &Path,
 ) -> Result<Option<Vec<Extra>>> {
+    let mixture = &config.mixture;
     let selected: Option<Vec<Extra>> = match mixture.source {
         SourceRows::None => None,
         SourceRows::All => {
-            let all = Extra { rows: Arc::new(inputs.source_rows()?.clone()), scores: source_scores };
+            let rows = match config.learner.algorithm.looks_at_successors() {
+                true => inputs.source_rows()?,
+                false => inputs.source()?.complete(),
+            };
+            let all = Extra { rows: Arc::new(rows.clone()), scores: source_scores };
             Some(vec![all; seeds.len()])
         }
         SourceRows::Relabelled => {

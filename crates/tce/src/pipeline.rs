@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
 use crate::joint;
-use crate::learning::{Learned, MemberData, learn};
+use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::methods::{closeness, row_scores};
 use crate::mixture::{Extra, distances, extra_rows};
 use crate::stage::Stage;
@@ -55,11 +55,6 @@ impl Summary {
     pub fn policies(&self) -> Vec<PathBuf> {
         self.seeds.iter().map(|seed| self.directory.join(policy_file(*seed))).collect()
     }
-}
-
-/// The file of the policy of a seed.
-fn policy_file(seed: u64) -> String {
-    format!("policy-seed{seed}.safetensors")
 }
 
 /// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
@@ -135,6 +130,7 @@ pub fn run(
     place: &str,
     device: &Device,
 ) -> Result<Summary> {
+    inputs.ensure_episodes(&config.learner)?;
     let generated = config.mixture.generated != GeneratedRows::None;
     let two_stages = config.mixture.generated == GeneratedRows::Tce;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
@@ -175,13 +171,18 @@ pub fn run(
     }
     let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
     let scores = config.source_scores(inputs, root)?;
-    let extra = extra_rows(inputs, &config.mixture, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
+    let extra = extra_rows(inputs, config, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
     drop((tables, models));
 
     if let Some(choice) = inputs.choice(&config.target) {
         eprintln!("{name}: {}", choice.reason);
     }
-    let target = Arc::new(inputs.imitated(&config.target).into_owned());
+    // Who models the dynamics has no use for a terminal row without a successor.
+    let target = match config.learner.algorithm.looks_at_successors() {
+        true => inputs.imitated(&config.target),
+        false => inputs.learned_from(&config.target),
+    };
+    let target = Arc::new(target.into_owned());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
         // Generated rows among them are no trajectories.
@@ -209,11 +210,8 @@ pub fn run(
     drop(extra);
     let place = (attempt.directory(), attempt.key());
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
-        for (policy, seed) in policies.iter().zip(seeds) {
-            let file = policy_file(*seed);
-            policy.save(&attempt.file(&file))?;
-            files.push(file);
-        }
+        save_policies(policies, seeds, attempt.directory(), inputs)?;
+        files.extend(seeds.iter().map(|&seed| policy_file(seed)));
         Ok(())
     })?;
     let summary = Summary {

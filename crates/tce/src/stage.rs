@@ -26,7 +26,7 @@ use crate::metrics::Metrics;
 use crate::processor::Processor;
 
 /// Changes when the same specification would give other bytes.
-const FORMAT: u32 = 3;
+const FORMAT: u32 = 4;
 /// Where attempts are, in a stage.
 pub(crate) const ATTEMPTS: &str = "attempts";
 

@@ -61,7 +61,7 @@ fn unusable_data_is_refused_before_any_work() {
         ("nan.hdf5", vec!["nan.hdf5", "rewards", "7"]),
         ("lacking.hdf5", vec!["lacking.hdf5", "rewards"]),
         ("wide.hdf5", vec!["wide.hdf5", "next_observations", "12", "11"]),
-        ("other.hdf5", vec!["different agents"]),
+        ("other.hdf5", vec!["different robots"]),
     ] {
         let (code, message) = augment(dir, "source.hdf5", file, &[]);
         assert_eq!(code, 1, "{file}: {message}");

@@ -87,13 +87,15 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert_eq!(rows_of("target-source"), 1500);
     assert_eq!(rows_of("iql-swt"), 1500);
     assert_eq!(rows_of("bc-raw"), 0);
-    assert_eq!(rows_of("tce-no-filter"), 600);
-    assert_eq!(rows_of("tce-no-reg"), 600, "no filter by default");
+    // Without a filter all rows stay but those that begin where a hopper has fallen.
+    let whole = rows_of("tce-no-filter");
+    assert!((570..=600).contains(&whole), "{whole}");
+    assert_eq!(rows_of("tce-no-reg"), whole, "no filter by default");
     let at = args.iter().position(|a| *a == variants).unwrap();
     args[at] = "tce-no-reg";
     args.extend(["--no-floors", "--set", "filter.enabled=true"]);
     let filtered = tce_json(dir.path(), &args)["rows"][0]["extra_rows"].as_u64().unwrap();
-    assert!(filtered < 600 && filtered > 0, "the filter rejects something, not all: {filtered}");
+    assert!(filtered < whole && filtered > 0, "the filter rejects something, not all: {filtered}");
 }
 
 /// Every rival and both of its modes, beside TCE's own rows under another learner.

@@ -3,28 +3,29 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::hdf5::{Column, Hdf5};
-use super::report::{Dropped, Layout, LoadReport, Successors};
-use super::rules::{self, Table};
-use super::{FORMAT, FORMAT_ATTRIBUTE};
-use crate::check::actions_outside;
+use super::episodes::{self, Table};
+use super::flat::Flat;
+use super::formats::FORMATS;
+use super::hdf5::Hdf5;
+use super::minari::main_file;
+use super::report::{Dropped, EpisodeEnds, Layout, LoadReport, Successors};
+use super::rows;
 use crate::{DataError, Problem, Transitions};
 
 /// What the caller knows about the file.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LoadOptions {
-    /// Steps after which the collector cut an episode (`None`: never). Only looked at where the file has no `timeouts`.
+    /// Steps after which the collector cut an episode (`None`: never): 1000 for the benchmark's robots. Only looked at where the file has
+    /// no `timeouts`.
     pub step_limit: Option<usize>,
     /// State and action dimension that the file must have, for example [`Agent::dims`](crate::Agent::dims).
     pub dims: Option<(usize, usize)>,
     /// Further columns to read, shape (N,) or (N, 1).
     pub columns: Vec<String>,
-}
-
-impl Default for LoadOptions {
-    fn default() -> Self {
-        Self { step_limit: Some(1000), dims: None, columns: Vec::new() }
-    }
+    /// Read every further column that there is (D4RL's and OTDF's layouts); what cannot be read as one is told.
+    pub all_columns: bool,
+    /// Look at files of ours, too: somebody may have changed them since.
+    pub distrust_own: bool,
 }
 
 /// A validated data set.
@@ -42,202 +43,163 @@ pub struct Loaded {
 ///
 /// # Errors
 /// A missing or unreadable file, one that is not HDF5, is cut off or damaged; a missing field, a wrong shape or type;
-/// fields that disagree; NaN or infinity; a file without (usable) rows. Actions outside of [-1, 1] are a warning.
+/// fields that disagree; NaN or infinity; a file without (usable) rows.
 pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
-    let file = Hdf5::open(path)?;
-    let (mut stored, mut observed) = (None, None);
-    // The two large columns are inflated side by side, each through a handle of its own.
-    rayon::scope(|s| {
-        if file.has("next_observations") {
-            s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix("next_observations"))));
-        }
-        observed = Some(file.matrix("observations"));
-    });
-    let observations = observed.expect("the scope has run")?;
-    let stored = stored.transpose()?;
-    let actions = file.matrix("actions")?;
-    let rewards = file.vector("rewards")?;
-    let terminals = file.flags("terminals")?;
-    let timeouts = if file.has("timeouts") { Some(file.flags("timeouts")?) } else { None };
-    let rows = observations.rows;
-    let mut columns = BTreeMap::new();
-    for name in &options.columns {
-        columns.insert(name.clone(), file.vector(name)?.data);
-    }
-    let mut counts = vec![("actions", actions.rows), ("rewards", rewards.rows), ("terminals", terminals.len())];
-    counts.extend(stored.as_ref().map(|c| ("next_observations", c.rows)));
-    counts.extend(timeouts.as_ref().map(|t| ("timeouts", t.len())));
-    counts.extend(columns.iter().map(|(k, v)| (k.as_str(), v.len())));
-    if let Some((name, n)) = counts.iter().find(|c| c.1 != rows) {
-        let expected = format!("{rows} rows, as in `observations`");
-        let advice = "The fields must have one row per transition: write the file again";
-        return Err(file.invalid(Problem::RowCount, name, format!("{n} rows"), expected, advice));
-    }
-    check_dimensions(&file, &observations, &actions, stored.as_ref(), options.dims)?;
-
+    let file = Hdf5::open(&main_file(path))?;
+    let format = FORMATS.into_iter().find(|format| format.recognises(&file)).unwrap_or(&Flat);
+    let raw = format.read(&file, options)?;
+    raw.check_dims(&file, options.dims)?;
+    let (rows, layout, mut columns) = (raw.rewards.len(), raw.layout, raw.columns);
+    // After the last number is read.
     let mut warnings = file.notes();
-    if observations.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
-        warnings.push("states are stored as float64; they were rounded to float32".to_owned());
-    }
-    warnings.extend(actions_outside(&actions.data, actions.dim).map(|w| format!("actions: {w}")));
-    let trusted = file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT);
-    let layout = match (trusted, &stored, &timeouts) {
-        (true, Some(_), Some(_)) => Layout::Tce,
-        (_, Some(_), None) => Layout::Otdf,
-        _ => Layout::D4rl,
-    };
-    let raw = Raw { dim: observations.dim, observations: &observations.data, terminals: &terminals };
-    let Resolved { next_observations, timeouts, keep, successors, dropped } =
-        raw.resolve(layout, stored.map(|c| c.data), timeouts, options.step_limit, &mut warnings);
+    warnings.extend(raw.warnings);
     let mut transitions = Transitions {
-        obs_dim: observations.dim,
-        act_dim: actions.dim,
-        observations: observations.data,
-        actions: actions.data,
-        rewards: rewards.data,
-        next_observations,
-        terminals,
-        timeouts,
+        obs_dim: raw.obs_dim,
+        act_dim: raw.act_dim,
+        observations: raw.observations,
+        actions: raw.actions,
+        rewards: raw.rewards,
+        next_observations: raw.next_observations.unwrap_or_default(),
+        terminals: raw.terminals,
+        timeouts: raw.timeouts.unwrap_or_default(),
+        known: raw.known.unwrap_or_else(|| vec![true; rows]),
     };
-    if dropped.total() > 0 {
-        let t = &mut transitions;
-        rules::cut_before_dropped(&keep, &t.terminals, &mut t.timeouts);
-        rules::retain_rows(&mut t.observations, t.obs_dim, &keep);
-        rules::retain_rows(&mut t.actions, t.act_dim, &keep);
-        rules::retain_rows(&mut t.rewards, 1, &keep);
-        rules::retain_rows(&mut t.next_observations, t.obs_dim, &keep);
-        rules::retain_rows(&mut t.terminals, 1, &keep);
-        rules::retain_rows(&mut t.timeouts, 1, &keep);
-        columns.values_mut().for_each(|c| rules::retain_rows(c, 1, &keep));
-    }
+    let summary = match layout {
+        Layout::Otdf | Layout::D4rl => settle(&mut transitions, &mut columns, options.step_limit, &mut warnings),
+        // Somebody has changed a file of ours: it is looked at like any other.
+        Layout::Tce if options.distrust_own && episodes::has_unmarked_ends(&table(&transitions, None)) => {
+            settle(&mut transitions, &mut columns, options.step_limit, &mut warnings)
+        }
+        // Their marks and successors are right by construction.
+        Layout::Tce | Layout::Minari | Layout::Robomimic => {
+            let mut summary = Summary::plain();
+            summary.dropped.last_row = drop_cut_ends(&mut transitions, &mut columns);
+            summary
+        }
+    };
     if transitions.is_empty() {
         let found = format!("{rows} rows, none of them with a usable next state");
         let advice = "Add `next_observations`, or use a longer data set";
         return Err(file.invalid(Problem::Empty, "observations", found, "at least one transition", advice));
     }
-    let terminals_without_successor = match successors {
-        Successors::Stored => 0,
-        Successors::NextRow => transitions.terminals.iter().filter(|&&t| t).count(),
-    };
-    if terminals_without_successor > 0 {
+    let unknown_successors = transitions.known.iter().filter(|&&known| !known).count();
+    if unknown_successors > 0 {
         warnings.push(format!(
-            "{terminals_without_successor} terminal rows have the next episode's first state as next state; this file \
-             holds no other. Values are not affected; for a model of the dynamics, store `next_observations`"
+            "{unknown_successors} terminal rows are without a next state. Policies learn from them; models of the dynamics do not: store \
+             `next_observations` for that"
         ));
     }
+    let Summary { environments, ends, successors, dropped } = summary;
     let report = LoadReport {
         file: path.to_owned(),
         layout,
         successors,
+        episodes: ends,
+        environments,
         rows_in_file: rows,
         rows_kept: transitions.len(),
         dropped,
-        terminals_without_successor,
+        unknown_successors,
         warnings,
     };
     Ok(Loaded { transitions, columns, report })
 }
 
+/// Drops rows that are no terminals and whose successor is not known: the last ones of demonstrations. How many they were.
+fn drop_cut_ends(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>) -> usize {
+    let keep: Vec<bool> = t.known.iter().zip(&t.terminals).map(|(known, terminal)| *known || *terminal).collect();
+    retain(t, columns, &keep);
+    keep.iter().filter(|&&k| !k).count()
+}
+
+/// Drops the rows that are not kept; the row before one that goes ends its episode.
+fn retain(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, keep: &[bool]) {
+    if keep.iter().all(|&k| k) {
+        return;
+    }
+    rows::cut_before_dropped(keep, &t.terminals, &mut t.timeouts);
+    rows::retain(&mut t.observations, t.obs_dim, keep);
+    rows::retain(&mut t.actions, t.act_dim, keep);
+    rows::retain(&mut t.rewards, 1, keep);
+    rows::retain(&mut t.next_observations, t.obs_dim, keep);
+    for flags in [&mut t.terminals, &mut t.timeouts, &mut t.known] {
+        rows::retain(flags, 1, keep);
+    }
+    columns.values_mut().for_each(|c| rows::retain(c, 1, keep));
+}
+
 /// The attributes of the file's root group, as text.
 pub fn read_attributes(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
-    Hdf5::open(path)?.attributes()
+    Hdf5::open(&main_file(path))?.attributes()
 }
 
-fn check_dimensions(
-    file: &Hdf5,
-    observations: &Column,
-    actions: &Column,
-    stored: Option<&Column>,
-    dims: Option<(usize, usize)>,
-) -> Result<(), DataError> {
-    let differ = |field: &str, found: usize, expected: usize, what: &str, advice: &str| {
-        let expected = format!("{expected} columns{what}");
-        Err(file.invalid(Problem::Dimension, field, format!("{found} columns"), expected, advice))
-    };
-    if let Some(next) = stored.filter(|n| n.dim != observations.dim) {
-        let advice = "A state and its successor have the same dimension: write the file again";
-        return differ("next_observations", next.dim, observations.dim, ", as in `observations`", advice);
-    }
-    if let Some((o, a)) = dims {
-        let advice = "This is a file of another agent: choose the file, or the agent, that fits";
-        if observations.dim != o {
-            return differ("observations", observations.dim, o, "", advice);
-        }
-        if actions.dim != a {
-            return differ("actions", actions.dim, a, "", advice);
-        }
-    }
-    Ok(())
-}
-
-/// The file's columns that decide about rows.
-struct Raw<'a> {
-    dim: usize,
-    observations: &'a [f32],
-    terminals: &'a [bool],
-}
-
-struct Resolved {
-    next_observations: Vec<f32>,
-    timeouts: Vec<bool>,
-    keep: Vec<bool>,
+/// What was decided about a whole file.
+struct Summary {
+    environments: usize,
+    ends: EpisodeEnds,
     successors: Successors,
     dropped: Dropped,
 }
 
-impl Raw<'_> {
-    fn resolve(
-        &self,
-        layout: Layout,
-        stored: Option<Vec<f32>>,
-        timeouts: Option<Vec<bool>>,
-        limit: Option<usize>,
-        warnings: &mut Vec<String>,
-    ) -> Resolved {
-        let Some(next_observations) = stored else {
-            let timeouts = timeouts.unwrap_or_else(|| {
-                warnings.push(match limit {
-                    Some(n) => {
-                        format!("no `timeouts` field: episodes are taken to end after {n} steps or at a terminal")
-                    }
-                    None => "no `timeouts` field: episodes are taken to end at terminals only".to_owned(),
-                });
-                rules::count_timeouts(self.terminals, limit)
-            });
-            return self.next_row(timeouts);
-        };
-        let table = Table {
-            dim: self.dim,
-            observations: self.observations,
-            next_observations: &next_observations,
-            terminals: self.terminals,
-        };
-        let (timeouts, wrong) = match timeouts {
-            Some(timeouts) if layout == Layout::D4rl && rules::successors_are_next_rows(&table, &timeouts) => {
-                warnings.push(
-                    "the stored next_observations are the following row's state even where an episode ends; they are \
-                     treated as absent"
-                        .to_owned(),
-                );
-                return self.next_row(timeouts);
-            }
-            Some(timeouts) => (timeouts, vec![false; self.terminals.len()]),
-            None => rules::infer_boundaries(&table, limit),
-        };
-        let keep: Vec<bool> = wrong.iter().map(|w| !w).collect();
-        let dropped = Dropped { wrong_successor: wrong.iter().filter(|&&w| w).count(), ..Dropped::default() };
-        Resolved { next_observations, timeouts, keep, successors: Successors::Stored, dropped }
+impl Summary {
+    /// Of a file in which nothing had to be put right.
+    fn plain() -> Self {
+        let (ends, successors) = (EpisodeEnds::Marks, Successors::Stored);
+        Self { environments: 1, ends, successors, dropped: Dropped::default() }
     }
+}
 
-    /// D4RL's `qlearning_dataset` for files without successors: s'_i = s_{i+1}; time-out rows and the last row have
-    /// none and are dropped.
-    fn next_row(&self, timeouts: Vec<bool>) -> Resolved {
-        let rows = self.terminals.len();
-        let mut next_observations = self.observations[self.dim..].to_vec();
-        next_observations.extend_from_slice(&self.observations[self.observations.len() - self.dim..]);
-        let keep = (0..rows).map(|i| i + 1 < rows && !timeouts[i]).collect();
-        let time_out = timeouts[..rows - 1].iter().filter(|&&t| t).count();
-        let dropped = Dropped { time_out, last_row: 1, ..Dropped::default() };
-        Resolved { next_observations, timeouts, keep, successors: Successors::NextRow, dropped }
+/// Puts the rows in order, finds the ends of episodes and the successors, and drops what is of no use.
+/// `t.next_observations` and `t.timeouts` are empty where the file has none, and complete afterwards.
+fn settle(
+    t: &mut Transitions,
+    columns: &mut BTreeMap<String, Vec<f32>>,
+    limit: Option<usize>,
+    warnings: &mut Vec<String>,
+) -> Summary {
+    let rows = t.len();
+    let environments = episodes::environments(&table(t, limit));
+    if environments > 1 {
+        warnings.push(format!(
+            "the rows of {environments} environments take turns (s' is the state {environments} rows later): they were put one environment \
+             after the other"
+        ));
+        reorder(t, columns, &episodes::untangled(rows, environments));
     }
+    let out = episodes::resolve(&table(t, limit), environments);
+    warnings.extend(out.warnings);
+    if t.next_observations.is_empty() {
+        t.next_observations = t.observations[t.obs_dim..].to_vec();
+        t.next_observations.extend_from_slice(&t.observations[t.observations.len() - t.obs_dim..]);
+    }
+    let d = t.obs_dim;
+    for i in (0..rows).filter(|&i| !out.known[i]) {
+        t.next_observations[i * d..(i + 1) * d].copy_from_slice(&t.observations[i * d..(i + 1) * d]);
+    }
+    (t.timeouts, t.known) = (out.timeouts, out.known);
+    retain(t, columns, &out.keep);
+    Summary { environments, ends: out.ends, successors: out.successors, dropped: out.dropped }
+}
+
+fn table(t: &Transitions, limit: Option<usize>) -> Table<'_> {
+    Table {
+        dim: t.obs_dim,
+        observations: &t.observations,
+        next_observations: (!t.next_observations.is_empty()).then_some(&t.next_observations[..]),
+        terminals: &t.terminals,
+        timeouts: (!t.timeouts.is_empty()).then_some(&t.timeouts[..]),
+        limit,
+    }
+}
+
+fn reorder(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, order: &[usize]) {
+    t.observations = rows::reordered(&t.observations, t.obs_dim, order);
+    t.actions = rows::reordered(&t.actions, t.act_dim, order);
+    t.rewards = rows::reordered(&t.rewards, 1, order);
+    t.next_observations = rows::reordered(&t.next_observations, t.obs_dim, order);
+    t.terminals = rows::reordered(&t.terminals, 1, order);
+    if !t.timeouts.is_empty() {
+        t.timeouts = rows::reordered(&t.timeouts, 1, order);
+    }
+    columns.values_mut().for_each(|c| *c = rows::reordered(c, 1, order));
 }

@@ -2,23 +2,38 @@
 //!
 //! | layout | recognised by | successors | episode boundaries |
 //! |---|---|---|---|
-//! | OTDF | `next_observations`, no `timeouts` | stored; wrong ones dropped | terminal, step limit, s'_i ≠ s_{i+1} |
-//! | D4RL | everything else | stored if there (and right), else the next row, time-out rows dropped | `timeouts`, `terminals` |
+//! | OTDF | `next_observations`, no `timeouts` | stored; wrong ones dropped | terminal, s'ᵢ ≠ sᵢ₊₁, step limit |
+//! | D4RL | everything else | stored if there (and right), else the next row, time-out rows dropped | `timeouts`, `terminals`, s'ᵢ ≠ sᵢ₊₁ |
+//!
+//! Whether s'ᵢ = sᵢ₊₁ is asked within a tolerance of each column's scale. Rows of several environments in turn are put in order. A
+//! terminal row without a successor stays, marked ([`Transitions::known`](crate::Transitions::known)).
 //!
 //! Nothing is used before the whole file has been validated, and no malformed file may panic or make the reader
 //! allocate far beyond the file's own size.
 
+mod episodes;
+mod episodes_in_groups;
+mod flat;
+mod formats;
 mod hdf5;
 mod load;
+mod minari;
 mod report;
-mod rules;
+mod robomimic;
+mod rows;
 mod save;
+mod save_minari;
+mod steps;
 
 pub use load::{LoadOptions, Loaded, load, read_attributes};
-pub use report::{Dropped, Layout, LoadReport, Successors};
+pub use minari::main_file;
+pub use report::{Dropped, EpisodeEnds, Layout, LoadReport, Successors};
 pub use save::save_d4rl;
+pub use save_minari::save_minari;
 
 /// Root attribute of files written by [`save_d4rl`]: their `next_observations` are right by construction, and a
 /// time-out between two rows that do follow each other is meant.
 const FORMAT_ATTRIBUTE: &str = "tce_format";
 const FORMAT: &str = "transitions-1";
+/// Which successors are known, in files written by [`save_d4rl`]; only there where not all are.
+const KNOWN: &str = "next_observations_known";

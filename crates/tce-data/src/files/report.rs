@@ -15,6 +15,22 @@ pub enum Layout {
     D4rl,
     /// Written by [`save_d4rl`](crate::save_d4rl).
     Tce,
+    /// A Minari data set.
+    Minari,
+    /// A file of robomimic.
+    Robomimic,
+}
+
+impl fmt::Display for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Otdf => "OTDF",
+            Self::D4rl => "D4RL",
+            Self::Tce => "tce",
+            Self::Minari => "Minari",
+            Self::Robomimic => "robomimic",
+        })
+    }
 }
 
 /// Where s' comes from.
@@ -25,6 +41,34 @@ pub enum Successors {
     Stored,
     /// s'_i = s_{i+1}; the time-out rows, which have no such successor, are dropped (D4RL's `qlearning_dataset`).
     NextRow,
+}
+
+/// What told where episodes end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EpisodeEnds {
+    /// `timeouts` and `terminals`, and every row whose s' is not the next row's state.
+    Marks,
+    /// Rows whose s' is not the next row's state, and `terminals`.
+    Continuity,
+    /// `terminals` and a step limit, for want of anything else.
+    StepLimit(usize),
+    /// `terminals` alone, for want of anything else.
+    Terminals,
+    /// Nothing: the rows are in no order, and each is an episode of its own.
+    NoOrder,
+}
+
+impl fmt::Display for EpisodeEnds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Marks => f.write_str("episodes end where the file marks it"),
+            Self::Continuity => f.write_str("episodes end where s' is not the next row's state"),
+            Self::StepLimit(n) => write!(f, "episodes end at terminals and after {n} steps"),
+            Self::Terminals => f.write_str("episodes end at terminals"),
+            Self::NoOrder => f.write_str("rows in no order"),
+        }
+    }
 }
 
 /// Rows of the file that are not in the result, by reason.
@@ -54,31 +98,30 @@ pub struct LoadReport {
     pub layout: Layout,
     /// What was taken as s'.
     pub successors: Successors,
+    /// What told where episodes end.
+    pub episodes: EpisodeEnds,
+    /// Environments whose rows took turns; 1 where they did not.
+    pub environments: usize,
     /// Rows in the file.
     pub rows_in_file: usize,
     /// Rows in the result: `rows_in_file` less all of `dropped`.
     pub rows_kept: usize,
     /// What is missing.
     pub dropped: Dropped,
-    /// Kept terminal rows whose s' is the next episode's first state, because the file holds no other. Harmless for
-    /// values (nothing is bootstrapped there), wrong for a model of the dynamics.
-    pub terminals_without_successor: usize,
+    /// Kept terminal rows whose s' the file does not hold. Harmless for values (nothing is bootstrapped there); models of the
+    /// dynamics leave them out.
+    pub unknown_successors: usize,
     /// What the user should know.
     pub warnings: Vec<String>,
 }
 
 impl fmt::Display for LoadReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let layout = match self.layout {
-            Layout::Otdf => "OTDF",
-            Layout::D4rl => "D4RL",
-            Layout::Tce => "tce",
-        };
         let successors = match self.successors {
             Successors::Stored => "stored next_observations",
             Successors::NextRow => "next states from the next row",
         };
-        write!(f, "{}: {layout} layout, {successors}, ", self.file.display())?;
+        write!(f, "{}: {} layout, {successors}, {}, ", self.file.display(), self.layout, self.episodes)?;
         write!(f, "{} of {} rows", self.rows_kept, self.rows_in_file)?;
         for (rows, reason) in [
             (self.dropped.wrong_successor, "a wrong stored successor"),

@@ -1,12 +1,13 @@
 //! From [`Transitions`] to a file that D4RL's loaders and h5py read.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::Path;
 
 use hdf5_pure::{AttrValue, DatasetBuilder, EnumTypeBuilder, FileBuilder, make_i8_type};
 use tce_base::{AtomicFile, FileError};
 
-use super::{FORMAT, FORMAT_ATTRIBUTE};
+use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem, Transitions};
 
 /// Bytes per chunk before compression: large enough to compress well, small enough to inflate a few at a time.
@@ -20,7 +21,7 @@ const DEFLATE_LEVEL: u32 = 4;
 
 /// Writes `data` in D4RL's layout with `next_observations`: `observations`, `actions`, `next_observations` (f32, (N, D)),
 /// `rewards` (f32, (N,)), `terminals`, `timeouts` (h5py booleans, (N,)), gzip and shuffle; `attributes` on the root;
-/// `columns` (f32, (N,)) beside the others. The file is complete or absent.
+/// `columns` (f32, (N,)) beside the others, those named `GROUP/NAME` in a group. The file is complete or absent.
 ///
 /// # Errors
 /// No rows, columns of other lengths, a column with a reserved name, a full disk.
@@ -46,28 +47,51 @@ pub fn save_d4rl(
         compress(dataset, &[data.len(), dim], 4);
     }
     compress(builder.create_dataset("rewards").with_f32_data(&data.rewards), &[data.len()], 4);
-    for (name, flags) in [("terminals", &data.terminals), ("timeouts", &data.timeouts)] {
+    let mut all_flags = vec![("terminals", &data.terminals), ("timeouts", &data.timeouts)];
+    if !data.known.iter().all(|&known| known) {
+        all_flags.push((KNOWN, &data.known));
+    }
+    for (name, flags) in all_flags {
         let bytes = flags.iter().map(|&f| f as u8).collect();
         let dataset = builder.create_dataset(name).with_raw_data(boolean.clone(), bytes, data.len() as u64);
         compress(dataset, &[data.len()], 1);
     }
+    let (mut plain, mut grouped) = (Vec::new(), BTreeMap::<&str, Vec<_>>::new());
     for (name, values) in columns {
+        match name.split_once('/') {
+            None => plain.push((name, values)),
+            Some((group, name)) => grouped.entry(group).or_default().push((name, values)),
+        }
+    }
+    for (name, values) in plain {
         compress(builder.create_dataset(name).with_f32_data(values), &[data.len()], 4);
+    }
+    for (name, members) in grouped {
+        let mut group = builder.create_group(name);
+        for (name, values) in members {
+            compress(group.create_dataset(name).with_f32_data(values), &[data.len()], 4);
+        }
+        builder.add_group(group.finish());
     }
     builder.set_attr(FORMAT_ATTRIBUTE, AttrValue::VarLenString(FORMAT.into()));
     for (name, value) in attributes.iter().filter(|(n, _)| *n != FORMAT_ATTRIBUTE) {
         builder.set_attr(name, AttrValue::VarLenString(value.clone()));
     }
     let mut file = AtomicFile::create(path)?;
-    builder.finish_to(file.file()).map_err(|e| {
+    finish(builder, file.file(), path)?;
+    file.commit()?;
+    Ok(())
+}
+
+/// Writes what was built into `file`; `path` is for messages.
+pub(super) fn finish(builder: FileBuilder, file: &mut File, path: &Path) -> Result<(), FileError> {
+    builder.finish_to(file).map_err(|e| {
         let source = match e {
             hdf5_pure::Error::Io(e) => e,
             other => std::io::Error::other(other.to_string()),
         };
         FileError::new(path, "write", source)
-    })?;
-    file.commit()?;
-    Ok(())
+    })
 }
 
 fn compress(dataset: &mut DatasetBuilder, shape: &[usize], element: usize) {
@@ -94,6 +118,7 @@ fn validate(path: &Path, data: &Transitions, columns: &[(&str, &[f32])]) -> Resu
         ("next_observations", data.next_observations.len(), n * data.obs_dim),
         ("terminals", data.terminals.len(), n),
         ("timeouts", data.timeouts.len(), n),
+        (KNOWN, data.known.len(), n),
     ];
     let more = columns.iter().map(|(name, values)| (*name, values.len(), n));
     for (name, found, expected) in own.into_iter().chain(more) {
@@ -103,8 +128,9 @@ fn validate(path: &Path, data: &Transitions, columns: &[(&str, &[f32])]) -> Resu
     }
     for (i, (name, _)) in columns.iter().enumerate() {
         let taken = own.iter().any(|o| o.0 == *name) || *name == "rewards" || columns[..i].iter().any(|c| c.0 == *name);
-        if taken || name.is_empty() || name.contains('/') {
-            let expected = "a new name without a slash".to_owned();
+        let parts: Vec<&str> = name.split('/').collect();
+        if taken || parts.len() > 2 || parts.contains(&"") || parts.len() == 2 && own.iter().any(|o| o.0 == parts[0]) {
+            let expected = "a new name, or GROUP/NAME".to_owned();
             return refuse(Problem::Value, name, "a reserved or repeated name".into(), expected);
         }
     }

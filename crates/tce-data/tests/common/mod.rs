@@ -2,8 +2,9 @@
 #![allow(dead_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Output};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use hdf5_pure::{EnumTypeBuilder, FileBuilder, make_i8_type};
@@ -29,6 +30,18 @@ pub fn rows(n: usize) -> Rows {
         terminals: vec![false; n],
         timeouts: vec![false; n],
     }
+}
+
+/// As [`rows`], in episodes of these lengths: each begins 1000 further on than the one before it ended, and every s' is the next
+/// row's state, whosever it is.
+pub fn rebuilt(lengths: &[usize]) -> Rows {
+    let n = lengths.iter().sum();
+    let episode = lengths.iter().enumerate().flat_map(|(k, &length)| std::iter::repeat_n(k, length));
+    let state = |(i, k): (usize, usize)| [(i + 1000 * k) as f32, -((i + 1000 * k) as f32)];
+    let observations: Vec<f32> = episode.enumerate().flat_map(state).collect();
+    let mut next = observations[2..].to_vec();
+    next.extend([0.0, 0.0]);
+    Rows { observations, next, ..rows(n) }
 }
 
 pub fn enum_flags(builder: &mut FileBuilder, name: &str, flags: &[bool]) {
@@ -85,7 +98,12 @@ pub fn write(dir: &tempfile::TempDir, name: &str, builder: FileBuilder) -> PathB
 }
 
 pub fn load(path: &Path) -> Result<Loaded, DataError> {
-    tce_data::load(path, &LoadOptions::default())
+    tce_data::load(path, &benchmark())
+}
+
+/// What is known of a benchmark robot's file.
+pub fn benchmark() -> LoadOptions {
+    LoadOptions { step_limit: Some(1000), ..LoadOptions::default() }
 }
 
 /// Asserts that `error` is of kind `problem` and that its message names the file, the field and all of `parts`.
@@ -112,6 +130,7 @@ pub fn synthetic(n: usize, obs_dim: usize, act_dim: usize, length: usize) -> Tra
         next_observations: draw(n * obs_dim),
         terminals: (0..n).map(|i| i % (3 * length) + 1 == 3 * length).collect(),
         timeouts: (0..n).map(|i| i % length + 1 == length && i % (3 * length) + 1 != 3 * length).collect(),
+        known: vec![true; n],
     }
 }
 
@@ -134,6 +153,48 @@ pub fn python(script: &str, argument: &Path) -> Option<String> {
     let out = Command::new(&python).args(["-c", script]).arg(argument).output().unwrap();
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     Some(String::from_utf8(out.stdout).unwrap())
+}
+
+/// The Python of a virtual environment under `target/` with `packages`, which `imports` come from, made when missing; `Err` says why
+/// there is none.
+///
+/// Made beside its place and moved there whole, so that test processes that run side by side cannot see half of one.
+pub fn environment(name: &str, packages: &[&str], imports: &str) -> Result<PathBuf, String> {
+    let root = Path::new(env!("CARGO_TARGET_TMPDIR"));
+    let place = root.join(name);
+    let python = |folder: &Path| folder.join("bin/python");
+    let works = |folder: &Path| {
+        Command::new(python(folder))
+            .args(["-c", &format!("import {imports}")])
+            .output()
+            .is_ok_and(|o| o.status.success())
+    };
+    if works(&place) {
+        return Ok(python(&place));
+    }
+    let run = |command: &mut Command| -> Result<(), String> {
+        let Output { status, stderr, .. } = command.output().map_err(|e| format!("{command:?}: {e}"))?;
+        let why = String::from_utf8_lossy(&stderr);
+        let last = why.lines().rfind(|l| !l.trim().is_empty()).unwrap_or("").to_owned();
+        if status.success() { Ok(()) } else { Err(format!("{command:?}: {last}")) }
+    };
+    fs::create_dir_all(root).map_err(|e| e.to_string())?;
+    let making = tempfile::Builder::new().prefix(name).tempdir_in(root).map_err(|e| e.to_string())?;
+    let base = std::env::var("TCE_PYTHON").unwrap_or_else(|_| "python3".into());
+    run(Command::new(base).args(["-m", "venv"]).arg(making.path()))?;
+    // Wheels only: building h5py from source takes minutes and HDF5's headers.
+    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"];
+    let patience = ["--retries", "1", "--timeout", "15"];
+    run(Command::new(python(making.path())).args(pip).args(patience).args(packages))?;
+    if !works(making.path()) {
+        return Err(format!("{name} was installed, and cannot be imported"));
+    }
+    // Another process may have been faster, or one that does not work is in the way.
+    if fs::rename(making.path(), &place).is_err() && !works(&place) {
+        fs::remove_dir_all(&place).map_err(|e| e.to_string())?;
+        fs::rename(making.path(), &place).map_err(|e| e.to_string())?;
+    }
+    Ok(python(&place))
 }
 
 /// Notes the largest single allocation of a test program that makes it its `global_allocator`.

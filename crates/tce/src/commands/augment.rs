@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_data::{Transitions, save_d4rl};
+use tce_data::Transitions;
 use tce_nn::Device;
 
 use crate::error::Result;
@@ -13,6 +13,7 @@ use crate::expand::{Generated, expand};
 use crate::inputs::Inputs;
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
+use crate::own::{Own, Writing};
 
 /// Arguments of `augment`.
 #[derive(Debug, Args)]
@@ -23,7 +24,7 @@ pub struct Augment {
     /// Few transitions of the changed robot.
     #[arg(long, value_name = "FILE")]
     target: PathBuf,
-    /// The file to write: target rows, then generated rows; column `origin` is 0 and 1.
+    /// The file (or, for Minari, the folder) to write: target rows, then generated rows; column `origin` is 0 and 1.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Write the generated rows alone.
@@ -35,9 +36,10 @@ pub struct Augment {
     /// Where trained networks are kept, for a second call with other settings.
     #[arg(long, default_value = "runs")]
     cache: PathBuf,
-    /// Replace an existing file.
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    writing: Writing,
+    #[command(flatten)]
+    own: Own,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -52,13 +54,14 @@ struct Augmented {
 impl Augment {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        super::refuse_existing(&self.out, self.force)?;
+        super::refuse_existing(&self.out, self.writing.force)?;
         super::refuse_inputs(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
-        let inputs = Inputs::of_files(Some(&self.source), &self.target)?.with_target_rows(config.target.rows);
+        let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
+        let inputs = inputs.with_target_rows(config.target.rows);
         let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;
-        let (generated, report) = (&expansion.tables[0], expansion.reports[0].clone());
-        let target = &inputs.target.rows;
+        let report = expansion.reports[0].clone();
+        let (generated, target) = (&inputs.in_own_units(&expansion.tables[0]), &inputs.target_in_own_units());
         let mut rows = Transitions::with_capacity(target.obs_dim, target.act_dim, target.len() + generated.len());
         let mut origin = Vec::new();
         if !self.only_generated {
@@ -78,7 +81,7 @@ impl Augment {
             ("config".to_owned(), config.to_toml()),
             ("program".to_owned(), crate::PROGRAM.to_owned()),
         ]);
-        save_d4rl(&self.out, &rows, &attributes, &[("origin", &origin)])?;
+        self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };
         output.print(&Augmented { file: self.out, target_rows: written, generated: report }, |a| {
             let g = &a.generated;

@@ -86,7 +86,7 @@ impl Collect {
         let started = std::time::Instant::now();
         let data = recipe.collect()?;
         save_d4rl(&self.out, &data, &attributes, &[])?;
-        let content = tce_data::inspect(&data, EPISODE_LIMIT);
+        let content = tce_data::inspect(&data, Some(EPISODE_LIMIT));
         if content.complete_episodes == 0 {
             eprintln!(
                 "no episode came to its end: {} rows on {} lanes are {} steps each; for whole episodes take more rows or fewer --lanes",

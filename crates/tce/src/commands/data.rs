@@ -1,18 +1,18 @@
 //! `tce data inspect | check | convert`.
 
-use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_data::{
-    Agent, Check, Inspection, LoadOptions, LoadReport, Loaded, ScoreTable, Severity, Shift, infer_agents, load,
-    parse_environment, reference_scores, save_d4rl,
+    ActionRange, Agent, Check, EpisodeEnds, Finding, Inspection, LoadOptions, LoadReport, Loaded, Problem, Quality,
+    ScoreTable, Severity, Shift, Transitions, infer_agents, load, read_attributes, reference_scores,
 };
-use tce_sim::{EPISODE_LIMIT, ReplayReport, replay};
+use tce_sim::{ReplayReport, replay};
 
 use crate::error::{Error, Result};
 use crate::output::{Output, table};
+use crate::own::{DataFormat, Own, Writing, range_of};
 
 /// Look at, check and convert data sets.
 #[derive(Debug, Subcommand)]
@@ -31,12 +31,11 @@ pub struct Inspect {
     /// HDF5 files in D4RL's or OTDF's layout.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The environment, for normalised scores (hopper, hopper-morph, ...); by default read from the file's name.
-    #[arg(long, value_parser = parse_environment)]
-    env: Option<(Agent, Shift)>,
     /// Show every dimension.
     #[arg(long)]
     dimensions: bool,
+    #[command(flatten)]
+    own: Own,
 }
 
 /// Arguments of `check`.
@@ -48,9 +47,8 @@ pub struct CheckArgs {
     /// Simulate every transition and compare s', r and terminal.
     #[arg(long)]
     replay: bool,
-    /// The environment (hopper, hopper-morph, ...); by default read from the file's name.
-    #[arg(long, value_parser = parse_environment)]
-    env: Option<(Agent, Shift)>,
+    #[command(flatten)]
+    own: Own,
 }
 
 /// Arguments of `convert`.
@@ -60,20 +58,49 @@ pub struct Convert {
     input: PathBuf,
     /// The file to write.
     output: PathBuf,
-    /// Replace an existing file.
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    writing: Writing,
+    #[command(flatten)]
+    own: Own,
 }
 
-/// The environment that a file's name tells: `ant_gravity_0.5_medium.hdf5`, `hopper-morph-....hdf5`.
-fn environment_of(path: &std::path::Path) -> Option<(Agent, Shift)> {
+impl Own {
+    /// Reads a file; where the user does not name its robot, a public file's name does, if the dimensions agree.
+    fn read(&self, file: &Path) -> Result<(Own, Loaded)> {
+        self.read_with(file, Own::load_options)
+    }
+
+    fn read_with(&self, file: &Path, options: impl Fn(&Own) -> LoadOptions) -> Result<(Own, Loaded)> {
+        let named = Own { env: self.env.or_else(|| environment_of(file)), ..self.clone() };
+        match load(file, &options(&named)) {
+            Err(e) if self.env.is_none() && e.problem() == Some(Problem::Dimension) => {
+                Ok((self.clone(), load(file, &options(self))?))
+            }
+            loaded => Ok((named, loaded?)),
+        }
+    }
+}
+
+/// The environment that the name of a benchmark's file tells: `ant_gravity_0.5_medium.hdf5`, `hopper_medium-v2.hdf5`,
+/// `hopper-morph-expert-1a2b3c.hdf5`. Somebody's own `hopper.hdf5`, or `antenna.hdf5`, is a robot like any other.
+fn environment_of(path: &Path) -> Option<(Agent, Shift)> {
     let name = path.file_stem()?.to_str()?;
     let agent = Agent::ALL.into_iter().find(|a| name.starts_with(a.name()))?;
-    let rest = &name[agent.name().len()..];
-    let rest = rest.strip_prefix(['-', '_']).unwrap_or(rest);
-    let shifts = [Shift::Gravity5, Shift::Gravity, Shift::Morph, Shift::Kinematic];
-    let shift = shifts.into_iter().find(|s| rest.starts_with(s.file_name()) || rest.starts_with(s.name()));
-    Some((agent, shift.unwrap_or(Shift::Source)))
+    let rest = name[agent.name().len()..].strip_prefix(['-', '_'])?;
+    let shifts = [Shift::Gravity5, Shift::Gravity, Shift::Morph, Shift::Kinematic, Shift::Source];
+    let shift = shifts.into_iter().find_map(|s| {
+        let tail = [s.file_name(), s.name()].into_iter().find_map(|n| rest.strip_prefix(n)?.strip_prefix(['-', '_']));
+        tail.map(|tail| (s, tail))
+    });
+    let (shift, tail) = shift.unwrap_or((Shift::Source, rest));
+    // What may follow the quality: D4RL's version, and the hash that our collector appends.
+    let tail = tail.replace('_', "-");
+    let hex = |t: &str| t.len() >= 6 && t.bytes().all(|b| b.is_ascii_hexdigit());
+    let tail = tail.rsplit_once('-').filter(|(_, end)| hex(end)).map_or(tail.as_str(), |(start, _)| start);
+    let version = |t: &str| t.strip_prefix('v').is_some_and(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()));
+    let tail = tail.rsplit_once('-').filter(|(_, end)| version(end)).map_or(tail, |(start, _)| start);
+    let known = tail == "random" || Quality::ALL.into_iter().any(|q| q.name() == tail);
+    known.then_some((agent, shift))
 }
 
 impl Data {
@@ -100,12 +127,9 @@ impl Inspect {
     fn run(self, output: Output) -> Result<()> {
         let mut all = Vec::new();
         for file in &self.files {
-            let Loaded { transitions, report, .. } = load(file, &LoadOptions::default())?;
-            let content = tce_data::inspect(&transitions, EPISODE_LIMIT);
-            let environment = self
-                .env
-                .or_else(|| environment_of(file))
-                .filter(|(a, _)| a.dims() == (transitions.obs_dim, transitions.act_dim));
+            let (own, Loaded { transitions, report, .. }) = self.own.read(file)?;
+            let content = tce_data::inspect(&transitions, own.limit());
+            let environment = own.env;
             let reference = environment.and_then(|(a, s)| reference_scores(a, s, ScoreTable::default()));
             all.push(Inspected {
                 load: report,
@@ -120,6 +144,7 @@ impl Inspect {
                 let c = &i.content;
                 [
                     i.load.file.file_name().map_or(String::new(), |n| n.to_string_lossy().into_owned()),
+                    i.load.layout.to_string(),
                     c.rows.to_string(),
                     i.load.dropped.total().to_string(),
                     format!("{}x{}", c.obs_dim, c.act_dim),
@@ -136,6 +161,7 @@ impl Inspect {
             });
             let header = [
                 "file",
+                "layout",
                 "rows",
                 "dropped",
                 "dims",
@@ -179,19 +205,59 @@ impl Inspect {
 struct Checked {
     load: LoadReport,
     environment: Option<String>,
+    content: Inspection,
+    uses: Uses,
     check: Check,
     replay: Option<ReplayReport>,
     passes: bool,
+}
+
+/// What rows will be used for.
+#[derive(Serialize)]
+struct Uses {
+    /// Learning policies.
+    learning: usize,
+    /// Score networks, inverse dynamics, rewards and models of the dynamics: rows whose s' is known.
+    dynamics: usize,
+    /// Returns of whole episodes, the better trajectories, sequence models: rows of episodes of two steps and more.
+    episodes: usize,
+    /// Where the terminal flags of generated rows will come from.
+    terminals: String,
+}
+
+impl Uses {
+    fn of(t: &Transitions, report: &LoadReport, agent: Option<Agent>) -> Self {
+        let ordered = report.episodes != EpisodeEnds::NoOrder;
+        let lengths = t.episodes().into_iter().map(|e| e.end - e.start);
+        let terminals = t.terminals.iter().filter(|&&t| t).count();
+        Self {
+            learning: t.len(),
+            dynamics: t.known.iter().filter(|&&k| k).count(),
+            episodes: if ordered { lengths.filter(|&n| n > 1).sum() } else { 0 },
+            terminals: match (agent, terminals) {
+                (Some(agent), _) => format!("{agent}'s rule"),
+                (None, 0) => "none: no row of this file is terminal".into(),
+                (None, n) => format!("learned from the {n} terminal rows"),
+            },
+        }
+    }
 }
 
 impl CheckArgs {
     fn run(self, output: Output) -> Result<()> {
         let mut all = Vec::new();
         for file in &self.files {
-            let environment = self.env.or_else(|| environment_of(file));
-            let options = LoadOptions { dims: environment.map(|(a, _)| a.dims()), ..LoadOptions::default() };
-            let Loaded { transitions, report, .. } = load(file, &options)?;
-            let check = tce_data::check(&transitions, environment.map(|(a, _)| a));
+            let (own, Loaded { transitions, report, .. }) = self.own.read(file)?;
+            let environment = own.env;
+            let mut check = tce_data::check(&transitions, own.agent());
+            if let Some(given) = &own.action_range {
+                let range = range_of(given, transitions.act_dim, file).map_err(Error::Usage)?;
+                let message = match range.outside(&transitions.actions) {
+                    0 => format!("taken as {range} (--action-range)"),
+                    n => format!("taken as {range} (--action-range); {n} values lie outside"),
+                };
+                check.findings.push(Finding { severity: Severity::Note, field: "actions", message });
+            }
             let replay = match (self.replay, environment) {
                 (false, _) => None,
                 (true, Some((agent, shift))) => Some(replay(agent, shift, &transitions, None)?),
@@ -204,9 +270,11 @@ impl CheckArgs {
             };
             let passes = check.is_ok() && replay.as_ref().is_none_or(ReplayReport::passes);
             let environment = environment.map(|(a, s)| format!("{a}-{s}"));
-            all.push(Checked { load: report, environment, check, replay, passes });
+            let uses = Uses::of(&transitions, &report, own.agent());
+            let content = tce_data::inspect(&transitions, own.limit());
+            all.push(Checked { load: report, environment, content, uses, check, replay, passes });
         }
-        output.print(&all, render_checks);
+        output.print(&all, |all| render_checks(all));
         match all.iter().filter(|c| !c.passes).count() {
             0 => Ok(()),
             n => Err(Error::Failed(format!("{n} of {} data sets do not pass", all.len()))),
@@ -214,18 +282,68 @@ impl CheckArgs {
     }
 }
 
-fn render_checks(all: &Vec<Checked>) -> String {
-    let mut text = String::new();
-    for c in all {
-        text += &format!("{}\n", c.load);
-        for finding in c.check.findings.iter().filter(|f| f.severity > Severity::Note) {
-            text += &format!("  {}: {}\n", finding.field, finding.message);
-        }
-        if c.passes && c.replay.is_none() {
-            text +=
-                "  passes: shapes, numbers, ranges and episodes; whether s' follows from s and a is told by --replay\n";
-        }
+/// The check of one file, on one screen.
+fn render_check(c: &Checked) -> String {
+    let (content, uses) = (&c.content, &c.uses);
+    let mut text = format!("{}\n", c.load);
+    let mut line = |name: &str, value: String| text += &format!("  {name:<11} {value}\n");
+    let robot = c.environment.clone().unwrap_or_else(|| "an own one".into());
+    line("robot", format!("{robot}, {} observations, {} actions", content.obs_dim, content.act_dim));
+    let lengths = &content.lengths;
+    let order = if c.load.environments > 1 {
+        format!(", of {} environments in turn", c.load.environments)
+    } else {
+        String::new()
+    };
+    let length = match lengths.min == lengths.max {
+        true => format!("{:.0} steps each", lengths.min),
+        false => format!("{:.0} to {:.0} steps, {:.0} on average", lengths.min, lengths.max, lengths.mean),
+    };
+    line(
+        "episodes",
+        format!("{}, {length}; {} whole{order}; {}", content.episodes, content.complete_episodes, c.load.episodes),
+    );
+    let ends = (content.terminals, content.timeouts);
+    line("ends", format!("{} terminals, {} time-outs or cuts", ends.0, ends.1));
+    let range = |name: &str, d: &tce_data::DimensionSummary| {
+        let (low, high) = (
+            d.min.iter().copied().fold(f32::INFINITY, f32::min),
+            d.max.iter().copied().fold(f32::NEG_INFINITY, f32::max),
+        );
+        (name.to_owned(), format!("{low:.4} to {high:.4}"))
+    };
+    for (name, d) in [("states", &content.observations), ("actions", &content.actions), ("rewards", &content.rewards)] {
+        let (name, value) = range(name, d);
+        line(&name, value);
     }
+    let returns = &content.returns;
+    line(
+        "returns",
+        format!(
+            "{:.1} ± {:.1}, {:.1} to {:.1}, of {} episodes",
+            returns.mean, returns.std, returns.min, returns.max, returns.count
+        ),
+    );
+    line("duplicates", format!("{:.1} % of the rows", 100.0 * c.check.duplicate_share));
+    line(
+        "used for",
+        format!(
+            "{} rows: learning; {}: networks and models of s'; {}: what follows episodes",
+            uses.learning, uses.dynamics, uses.episodes
+        ),
+    );
+    line("terminals", uses.terminals.clone());
+    for finding in &c.check.findings {
+        text += &format!("  {finding}\n");
+    }
+    if c.passes && c.replay.is_none() {
+        text += "  passes; whether s' follows from s and a is told by --replay, for a robot of the benchmark\n";
+    }
+    text
+}
+
+fn render_checks(all: &[Checked]) -> String {
+    let mut text: String = all.iter().map(render_check).collect();
     let rows = all.iter().filter_map(|c| {
         let r = c.replay.as_ref()?;
         Some([
@@ -252,9 +370,28 @@ fn render_checks(all: &Vec<Checked>) -> String {
 
 impl Convert {
     fn run(self, output: Output) -> Result<()> {
-        super::refuse_existing(&self.output, self.force)?;
-        let Loaded { transitions, report, .. } = load(&self.input, &LoadOptions::default())?;
-        save_d4rl(&self.output, &transitions, &BTreeMap::from([("origin".into(), report.to_string())]), &[])?;
+        super::refuse_existing(&self.output, self.writing.force)?;
+        let options = |own: &Own| LoadOptions { all_columns: true, ..own.load_options() };
+        let Loaded { transitions, columns, mut report } = self.own.read_with(&self.input, options)?.1;
+        let kept: Vec<(&str, &[f32])> =
+            columns.iter().map(|(name, values)| (name.as_str(), values.as_slice())).collect();
+        if self.writing.format == DataFormat::Minari && !kept.is_empty() {
+            let names: Vec<&str> = kept.iter().map(|(name, _)| *name).collect();
+            report
+                .warnings
+                .push(format!("Minari has no place for these columns, which are left out: {}", names.join(", ")));
+        }
+        let mut attributes = read_attributes(&self.input)?;
+        let origin = if attributes.contains_key("origin") { "converted_from" } else { "origin" };
+        attributes.insert(origin.into(), report.to_string());
+        if self.writing.format == DataFormat::Minari && report.unknown_successors > 0 {
+            report.warnings.push(format!(
+                "the last observation of {} episodes is not known and repeats the one before; Minari has no mark for that",
+                report.unknown_successors
+            ));
+        }
+        let range = ActionRange::of(&[&transitions]);
+        self.writing.write(&self.output, &transitions, range.as_ref(), &attributes, &kept)?;
         output.print(&report, |r| format!("{r}\nwritten to {}", self.output.display()));
         Ok(())
     }
@@ -263,7 +400,6 @@ impl Convert {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::path::Path;
 
     #[test]
     fn file_names_tell_environments() {
@@ -272,6 +408,18 @@ mod tests {
         assert_eq!(env("hopper_morph_expert.hdf5"), Some((Agent::Hopper, Shift::Morph)));
         assert_eq!(env("halfcheetah_medium-v2.hdf5"), Some((Agent::HalfCheetah, Shift::Source)));
         assert_eq!(env("ant_gravity_5.0_medium.hdf5"), Some((Agent::Ant, Shift::Gravity5)));
-        assert_eq!(env("mine.hdf5"), None);
+        assert_eq!(env("hopper-source-medium-5264d44bffc4.hdf5"), Some((Agent::Hopper, Shift::Source)));
+        assert_eq!(env("walker2d_kinematic_medium_expert.hdf5"), Some((Agent::Walker2d, Shift::Kinematic)));
+        for own in [
+            "mine.hdf5",
+            "hopper.hdf5",
+            "antenna_medium.hdf5",
+            "hopper_lab_day3.hdf5",
+            "ant.hdf5",
+            "hopper_expert_run2.hdf5",
+            "hopper_random_walk.hdf5",
+        ] {
+            assert_eq!(env(own), None, "{own}");
+        }
     }
 }

@@ -11,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::judge::{Judge, Judged};
 use crate::output::{Output, table};
+use crate::own::Own;
 
 /// Arguments of `judge`.
 #[derive(Debug, Args)]
@@ -30,6 +31,8 @@ pub struct JudgeArgs {
     /// Where the learned dynamics are kept, for a second call.
     #[arg(long, default_value = "runs")]
     cache: PathBuf,
+    #[command(flatten)]
+    own: Own,
 }
 
 #[derive(Serialize)]
@@ -49,7 +52,7 @@ struct Line {
 impl JudgeArgs {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        let inputs = Inputs::of_files(self.source.as_deref(), &self.target)?;
+        let inputs = Inputs::of_files(self.source.as_deref(), &self.target, None, &self.own)?;
         let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
         let load = |path: &PathBuf| -> Result<Policy> {
             let policy = Policy::load(path)?;

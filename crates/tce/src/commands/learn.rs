@@ -5,19 +5,20 @@ use std::sync::Arc;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use tce_base::{read_if_there, sha256_file, sha256_hex};
-use tce_data::{Agent, LoadOptions, ScoreTable, Shift, ensure_same_agent, load, parse_environment};
+use tce_base::{read_if_there, sha256_hex};
+use tce_data::ScoreTable;
 use tce_nn::Device;
 
 use crate::actors::Arena;
 use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
-use crate::inputs::{Inputs, first_rows};
+use crate::inputs::{Inputs, Table};
 use crate::judge::Judge;
 use crate::layers::ConfigArgs;
-use crate::learning::{Learned, MemberData, learn};
+use crate::learning::{Learned, MemberData, learn, save_policies};
 use crate::methods::{Method, row_scores};
 use crate::output::{Output, plus_minus, table};
+use crate::own::Own;
 use crate::pipeline::seeds;
 use crate::processor::Processor;
 use crate::verdict::{Candidate, Kept, keep, recommend};
@@ -52,12 +53,11 @@ pub struct Learn {
     /// Do not learn a floor from the target rows alone, do not try the policies, and recommend none.
     #[arg(long)]
     no_verdict: bool,
-    /// Evaluate in this environment at the end: hopper-morph, ...
-    #[arg(long, value_parser = parse_environment)]
-    env: Option<(Agent, Shift)>,
     /// Directory for policies and metrics.
     #[arg(long, required_unless_present = "list")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    own: Own,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -102,33 +102,21 @@ impl Learn {
                 method.name
             )));
         }
-        let dims = self.env.map(|(agent, _)| agent.dims());
-        let read = |path: &PathBuf| -> Result<Arc<_>> {
-            let loaded = load(path, &LoadOptions { dims, ..LoadOptions::default() })?;
-            eprintln!("{}", loaded.report);
-            Ok(Arc::new(loaded.transitions))
-        };
-        let target = read(&target_file)?;
-        let target = first_rows(&target, config.target.rows).map_or(target, Arc::new);
-        let extra = self.extra.as_ref().map(read).transpose()?;
-        if let Some(extra) = &extra {
-            ensure_same_agent(extra, &target)?;
-        }
-        // Read before anything is computed: a source that does not fit is no surprise after hours.
-        let inputs = match self.no_verdict {
-            true => None,
-            false => {
-                let inputs = Inputs::of_files(self.source.as_deref(), &target_file)?;
-                Some(inputs.with_target_rows(config.target.rows))
-            }
-        };
-        let arena = self.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
+        // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
+        let source = self.source.as_deref().filter(|_| !self.no_verdict);
+        let inputs = Inputs::of_files(source, &target_file, self.extra.as_deref(), &self.own)?;
+        let inputs = inputs.with_target_rows(config.target.rows);
+        inputs.ensure_episodes(&config.learner)?;
+        let complete = !config.learner.algorithm.looks_at_successors();
+        let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
+        let (target, extra) = (rows(&inputs.target), inputs.extra.as_ref().map(rows));
+        let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
         let mut spec = serde_json::json!({
-            "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "environment": &self.env,
-            "target": sha256_file(&target_file)?, "extra": self.extra.as_deref().map(sha256_file).transpose()?,
+            "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "own": &self.own, "actions": &inputs.actions,
+            "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
         });
-        if let Some(source) = &self.source {
-            spec["source"] = sha256_file(source)?.into();
+        if let Some(source) = &inputs.source {
+            spec["source"] = source.hash.clone().into();
         }
         Processor::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
@@ -155,19 +143,17 @@ impl Learn {
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
         let mut files = Vec::new();
         let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
-            for (policy, seed) in policies.iter().zip(&seeds) {
-                let file = out.join(format!("policy-seed{seed}.safetensors"));
-                policy.save(&file)?;
-                files.push(file);
-            }
+            files = save_policies(policies, &seeds, &out, &inputs)?;
             Ok(())
         })?;
-        let verdict = match &inputs {
-            None => None,
-            Some(inputs) => {
+        let verdict = match self.no_verdict {
+            true => None,
+            false => {
                 let own = Candidate { name: method.name.into(), floor: extra.is_none(), files: files.clone() };
-                let floor = extra.is_some().then(|| floor(alone, &config, &seeds, (&out, &key), device)).transpose()?;
-                let judge = || Judge::train(inputs, &config.dynamics, &out, device);
+                let place = (out.as_path(), key.as_str());
+                let floor =
+                    extra.is_some().then(|| floor(alone, &config, &seeds, place, &inputs, device)).transpose()?;
+                let judge = || Judge::train(&inputs, &config.dynamics, &out, device);
                 let verdict = recommend(judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
                 Some(keep(verdict, &out)?)
             }
@@ -185,17 +171,14 @@ fn floor(
     config: &Config,
     seeds: &[u64],
     (out, key): (&Path, &str),
+    inputs: &Inputs,
     device: &Device,
 ) -> Result<Candidate> {
     let learner = LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..config.learner.clone() };
     let directory = out.join("floor");
     let mut files = Vec::new();
     learn(data, &learner, &config.evaluation, None, (&directory, key), device, |policies| {
-        for (policy, seed) in policies.iter().zip(seeds) {
-            let file = directory.join(format!("policy-seed{seed}.safetensors"));
-            policy.save(&file)?;
-            files.push(file);
-        }
+        files = save_policies(policies, seeds, &directory, inputs)?;
         Ok(())
     })?;
     Ok(Candidate { name: "cloning the target rows".into(), floor: true, files })

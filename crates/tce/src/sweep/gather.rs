@@ -101,12 +101,12 @@ impl Sweep {
         conflicts
     }
 
-    /// What is wrong with the record or the files of a piece of work.
+    /// What is wrong with the record or the files of a piece of work, or with the files that it read.
     pub(super) fn damage(&self, entry: &Entry, outcome: &Outcome) -> Option<String> {
         if outcome.id != entry.id {
             return Some(format!("found the outcome of {}, expected that of {}", outcome.id, entry.id));
         }
-        first_damaged(&self.directory.join(&outcome.place), &outcome.files)
+        self.changed_input(entry).or_else(|| first_damaged(&self.directory.join(&outcome.place), &outcome.files))
     }
 }
 

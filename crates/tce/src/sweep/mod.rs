@@ -15,10 +15,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, read_if_there, sha256_hex, write_atomically};
-use tce_data::Task;
+use tce_base::{FileError, read_if_there, sha256_file, sha256_hex, write_atomically};
+use tce_data::{Task, main_file};
 
 use crate::PROGRAM;
 use crate::config::{Config, GeneratedRows, SourceRows};
@@ -180,6 +182,9 @@ pub struct Header {
     pub from_zoo: bool,
     /// Data files.
     pub data: BTreeMap<Task, Files>,
+    /// SHA-256 of the data files, when the sweep was planned.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub hashes: BTreeMap<PathBuf, String>,
     /// Configurations, TOML, by their hash.
     pub configs: BTreeMap<String, String>,
     /// Pieces of work.
@@ -218,11 +223,14 @@ impl Manifest {
         if description.variants.is_empty() || description.seeds == 0 {
             return Err(failed(&"there is nothing to run; give at least one task, one of `variants`, and seeds > 0"));
         }
-        let mut data = description.data.clone();
+        let (mut data, mut hashes) = (description.data.clone(), BTreeMap::new());
         for (task, files) in &mut data {
             for file in files.source.iter_mut().chain(&mut files.target) {
-                let full = base.join(&*file);
+                let full = main_file(&base.join(&*file));
                 *file = full.canonicalize().map_err(|e| failed(&format!("data of {task}: {}: {e}", full.display())))?;
+                if !hashes.contains_key(file) {
+                    hashes.insert(file.clone(), sha256_file(file)?);
+                }
             }
         }
         let mut variants = description.variants.clone();
@@ -241,6 +249,7 @@ impl Manifest {
             program: PROGRAM.into(),
             from_zoo: description.from_zoo,
             data,
+            hashes,
             configs: BTreeMap::new(),
             entries: 0,
         };
@@ -485,6 +494,33 @@ impl Sweep {
     /// The pieces of work.
     pub fn entries(&self) -> &[Entry] {
         &self.manifest.entries
+    }
+
+    /// What a user's own file of a piece of work has become since the sweep was planned; none if it is what it was.
+    pub fn changed_input(&self, entry: &Entry) -> Option<String> {
+        // A file is hashed once as long as its size and time stay; gathering asks for every run.
+        static KNOWN: Mutex<BTreeMap<(PathBuf, u64, SystemTime), String>> = Mutex::new(BTreeMap::new());
+        let files = self.manifest.header.data.get(&entry.task)?;
+        files.source.iter().chain(&files.target).find_map(|file| {
+            let expected = self.manifest.header.hashes.get(file)?;
+            let found = fs::metadata(file).map_err(|e| e.to_string()).and_then(|meta| {
+                let key = (file.clone(), meta.len(), meta.modified().map_err(|e| e.to_string())?);
+                let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+                if let Some(hash) = known.get(&key) {
+                    return Ok(hash.clone());
+                }
+                let hash = sha256_file(file).map_err(|e| e.to_string())?;
+                known.insert(key, hash.clone());
+                Ok(hash)
+            });
+            (found.as_ref() != Ok(expected)).then(|| {
+                format!(
+                    "{}: found {}, expected SHA-256 {expected} as when the sweep was planned; put that file back, or plan a new sweep",
+                    file.display(),
+                    found.map_or_else(|e| e, |hash| format!("SHA-256 {hash}"))
+                )
+            })
+        })
     }
 
     fn data(&self, entry: &Entry) -> DataArgs {

@@ -9,17 +9,21 @@ use tce_base::FileError;
 
 use super::work::{Failure, Outcome, now};
 use super::{Entry, Kind, Sweep};
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 impl Sweep {
     /// Takes back what is done and no longer whole, and tells what it was. Whether files exist is always looked at, their content if
     /// `thorough`.
     ///
     /// # Errors
-    /// If a folder cannot be written.
+    /// If a folder cannot be written; if `thorough`, and a user's own file changed since the sweep was planned.
     pub fn take_back_damaged(&self, thorough: bool) -> Result<Vec<String>> {
         let mut taken = Vec::new();
         for entry in self.entries() {
+            // What was made of the planned file is whole; another file is another sweep.
+            if let Some(change) = self.changed_input(entry).filter(|_| thorough) {
+                return Err(Error::Failed(change));
+            }
             let why = match self.outcome(entry) {
                 Ok(None) => continue,
                 Ok(Some(outcome)) => {

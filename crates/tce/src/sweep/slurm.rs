@@ -177,7 +177,7 @@ impl Sweep {
                         write_atomically(&list, lines.as_bytes())?;
                         write_atomically(&file, script(&directory, &list, &program, options).as_bytes())?;
                         let answer = call("sbatch", &command[1..])?;
-                        let job = answer.trim().split(';').next().unwrap_or_default().to_owned();
+                        let job = job_of(&answer)?;
                         write_atomically(&stem.with_extension("job"), job.as_bytes())?;
                         Some(job)
                     }
@@ -233,6 +233,20 @@ fn list(path: &Path) -> Vec<Vec<usize>> {
     text.lines().map(|line| line.split(' ').filter_map(|word| word.parse().ok()).collect()).collect()
 }
 
+/// The job's number in what `sbatch --parsable` printed: a line `NUMBER` or `NUMBER;CLUSTER`, after whatever banner the site prints.
+fn job_of(answer: &str) -> Result<String> {
+    let number = |line: &str| {
+        let id = line.trim().split(';').next().unwrap_or_default();
+        (!id.is_empty() && id.bytes().all(|b| b.is_ascii_digit())).then(|| id.to_owned())
+    };
+    answer.lines().rev().find_map(number).ok_or_else(|| {
+        Error::Failed(format!(
+            "sbatch: found {answer:?}, expected a job's number in a line of its own; the job may be in the queue (squeue), which is \
+             harmless: launch again"
+        ))
+    })
+}
+
 /// A name that no other submission has: the process's, and a number of its own.
 fn unique() -> String {
     static COUNT: AtomicU64 = AtomicU64::new(0);
@@ -243,6 +257,18 @@ fn unique() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_banner_is_no_job() {
+        for answer in
+            ["17", "17;alpha\n", "Welcome to cluster 9!\nquota: 5 of 10\n17\n", "note\n17;alpha\n\n", "17\nsee you;\n"]
+        {
+            assert_eq!(job_of(answer).unwrap(), "17", "{answer}");
+        }
+        for answer in ["", "Welcome;17", "Submitted batch job"] {
+            assert!(job_of(answer).unwrap_err().to_string().contains("expected a job's number"), "{answer}");
+        }
+    }
 
     #[test]
     fn the_script_hands_on_how_the_work_is_to_be_done() {

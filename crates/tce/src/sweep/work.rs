@@ -172,6 +172,9 @@ impl Sweep {
         if let Some(outcome) = self.outcome(entry)? {
             return Ok(outcome);
         }
+        if let Some(change) = self.changed_input(entry) {
+            return Err(Error::Failed(change));
+        }
         let beat = Heartbeat::start(self.file("active", &format!("{}.{}.json", entry.id, Owner::this())))?;
         let outcome = self.compute(entry, device).and_then(|outcome| self.settle(outcome));
         drop(beat);

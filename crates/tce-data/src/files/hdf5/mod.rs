@@ -53,6 +53,8 @@ pub(super) struct Column {
 enum Kind {
     /// (N, D), D >= 1. Must have been written.
     Matrix,
+    /// (N, D) or (N,). Must have been written.
+    Table,
     /// (N,) or (N, 1). What was never written is the fill value.
     Vector,
 }
@@ -94,7 +96,27 @@ impl Hdf5 {
         Ok(Self { path: path.to_owned(), bytes, file, names, notes })
     }
 
-    /// Whether the top level has this name, be it a data set, a group or a link.
+    /// The names in the group at `path` (empty: the top level); none if that is no group.
+    pub fn names_in(&self, path: &str) -> Result<Option<Vec<String>>, DataError> {
+        match self.names.find(path).map_err(|e| unreadable(&self.path, path, e))? {
+            Found::Group(names) => Ok(Some(names)),
+            _ => Ok(None),
+        }
+    }
+
+    /// The paths of the data sets at the top level and in its groups.
+    pub fn all_datasets(&self) -> Result<Vec<String>, DataError> {
+        let mut out = Vec::new();
+        for name in self.names_in("")?.unwrap_or_default() {
+            match self.names_in(&name)? {
+                None => out.push(name),
+                Some(inner) => out.extend(inner.into_iter().map(|inner| format!("{name}/{inner}"))),
+            }
+        }
+        Ok(out)
+    }
+
+    /// Whether the top level has this name, be it a data set, a group or a link; or whether this path leads somewhere.
     pub fn has(&self, name: &str) -> bool {
         self.names.has(name)
     }
@@ -117,6 +139,11 @@ impl Hdf5 {
     /// A matrix: shape (N, D), D >= 1.
     pub fn matrix(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Matrix)
+    }
+
+    /// A matrix, or a vector as a matrix of one column: shape (N, D) or (N,).
+    pub fn table(&self, name: &str) -> Result<Column, DataError> {
+        self.read(name, Kind::Table)
     }
 
     /// A vector: shape (N,) or (N, 1).
@@ -145,6 +172,19 @@ impl Hdf5 {
         DataError::invalid(problem, &self.path, field, found, expected, advice)
     }
 
+    /// The error of a field that is not there.
+    pub fn missing(&self, name: &str) -> DataError {
+        let names = self.names.list();
+        let keys = if names.is_empty() { "no data sets".into() } else { names.join(", ") };
+        self.invalid(
+            Problem::MissingField,
+            name,
+            format!("no such data set (the file has {keys})"),
+            "a data set of this name",
+            "Check that the file holds transitions in the layout of D4RL, OTDF, Minari or robomimic",
+        )
+    }
+
     fn note(&self, note: String) {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
@@ -153,17 +193,7 @@ impl Hdf5 {
     fn open_dataset(&self, name: &str) -> Result<Dataset, DataError> {
         let (path, header) = match self.names.find(name).map_err(|e| unreadable(&self.path, name, e))? {
             Found::At { path, header } => (path, header),
-            Found::Absent => {
-                let names = self.names.list();
-                let keys = if names.is_empty() { "no data sets".into() } else { names.join(", ") };
-                return Err(self.invalid(
-                    Problem::MissingField,
-                    name,
-                    format!("no such data set (the file has {keys})"),
-                    "a data set of this name at the top level",
-                    "Check that the file holds transitions in D4RL's or OTDF's layout",
-                ));
-            }
+            Found::Absent => return Err(self.missing(name)),
             Found::Group(members) => {
                 let members =
                     if members.is_empty() { "without members".into() } else { format!("of {}", members.join(", ")) };
@@ -213,11 +243,12 @@ impl Hdf5 {
             return Err(self.invalid(Problem::WrongType, name, format!("type {datatype}"), expected, advice));
         }
         let (rows, dim) = match (kind, &shape[..]) {
-            (Kind::Matrix, &[n, d]) if d > 0 => (n, d),
-            (Kind::Vector, &[n] | &[n, 1]) => (n, 1),
+            (Kind::Matrix | Kind::Table, &[n, d]) if d > 0 => (n, d),
+            (Kind::Table, &[n]) | (Kind::Vector, &[n] | &[n, 1]) => (n, 1),
             _ => {
                 let expected = match kind {
                     Kind::Matrix => "shape (N, D)",
+                    Kind::Table => "shape (N, D) or (N,)",
                     Kind::Vector => "shape (N,) or (N, 1)",
                 };
                 let advice = "Reshape it: one row per transition";
@@ -228,7 +259,7 @@ impl Hdf5 {
             return Err(self.invalid(Problem::Empty, name, "0 rows", "at least one row", "Use another file"));
         }
         let unwritten = match kind {
-            Kind::Matrix => Unwritten::Refuse,
+            Kind::Matrix | Kind::Table => Unwritten::Refuse,
             Kind::Vector => Unwritten::Fill,
         };
         let filled = self.ensure_stored(name, &dataset, unwritten)?;

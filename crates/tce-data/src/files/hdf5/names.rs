@@ -52,8 +52,12 @@ impl Names {
         Ok(Self { image, root, top })
     }
 
+    /// Whether there is a `name` at the top level, or at the end of a path; a link that leads nowhere counts.
     pub fn has(&self, name: &str) -> bool {
-        self.top.contains_key(name)
+        match name.split_once('/') {
+            None => self.top.contains_key(name),
+            Some(_) => matches!(self.find(name), Ok(Found::At { .. } | Found::Group(_) | Found::Nowhere(_))),
+        }
     }
 
     /// Every name at the top level: a group with a slash after it.
@@ -62,9 +66,12 @@ impl Names {
         self.top.iter().map(|(name, link)| if group(link) { format!("{name}/") } else { name.clone() }).collect()
     }
 
-    /// Where `name` leads.
+    /// Where `name`, or a path of names, leads. The empty name is the top level.
     pub fn find(&self, name: &str) -> io::Result<Found> {
-        let Some(first) = self.top.get(name) else {
+        if name.is_empty() {
+            return Ok(Found::Group(self.top.keys().cloned().collect()));
+        }
+        let Some(first) = self.top.get(name.split('/').next().unwrap_or_default()) else {
             return Ok(Found::Absent);
         };
         let dangling = || match first {
@@ -74,7 +81,7 @@ impl Names {
         let (mut at, mut path) = (self.root, Vec::new());
         let mut followed = 0;
         // The parts of the path still to walk, the next one last.
-        let mut parts = vec![name.to_owned()];
+        let mut parts: Vec<String> = name.split('/').rev().map(str::to_owned).collect();
         while let Some(part) = parts.pop() {
             if part.is_empty() || part == "." {
                 continue;

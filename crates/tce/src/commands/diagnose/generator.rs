@@ -14,7 +14,7 @@ use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, q
 use crate::error::Result;
 use crate::expand::{Finisher, label_models};
 use crate::generator::Generator;
-use crate::inputs::{DataArgs, Inputs, Table};
+use crate::inputs::{DataArgs, Inputs};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
 use crate::variant::Variant;
@@ -131,7 +131,7 @@ impl GeneratorArgs {
             Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows);
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
-        let inputs = Inputs { target: Table { rows: training, hash, ..inputs.target }, ..inputs };
+        let inputs = inputs.with_target(training, hash);
         let training = &inputs.target.rows;
         let seeds = [self.seed];
         let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.data.out, device)?;

@@ -16,6 +16,7 @@ use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, Inputs};
 use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
+use crate::own::Own;
 use crate::study::task_of;
 use crate::variant::Variant;
 
@@ -85,6 +86,8 @@ struct RunArgs {
     /// Episodes of the policy that the generator implies, in the simulator.
     #[arg(long, default_value_t = Options::default().episodes)]
     episodes: usize,
+    #[command(flatten)]
+    own: Own,
     #[command(flatten)]
     config: ConfigArgs,
 }
@@ -237,7 +240,8 @@ impl RunArgs {
             None => {
                 let config = self.config.layered(None, Some(Variant::TceOg))?.config()?;
                 let target = self.target.as_deref().expect("clap asks for it");
-                let inputs = Inputs::of_files(self.source.as_deref(), target)?.with_target_rows(config.target.rows);
+                let inputs = Inputs::of_files(self.source.as_deref(), target, None, &self.own)?;
+                let inputs = inputs.with_target_rows(config.target.rows);
                 let seed = self.seed.unwrap_or(0);
                 let subject = Subject {
                     of: target.display().to_string(),

@@ -1,0 +1,419 @@
+//! Where episodes end, in which order the rows are, and which successors are known. Facts about the public files: `datasets.md`.
+//!
+//! A file says it in up to three ways: by its marks (`terminals`, `timeouts`), by continuity (is the stored s'ᵢ the state of the next
+//! row?), and by a step limit that the caller knows. Continuity is compared within a tolerance of each column's own scale
+//! ([`Continuity`]), because successors are often stored with fewer digits. Where marks and continuity contradict each other,
+//! continuity wins, and the contradiction is told with row numbers.
+
+use std::cell::LazyCell;
+
+use rayon::prelude::*;
+
+use super::report::{Dropped, EpisodeEnds, Successors};
+use super::rows::tell;
+use super::steps::{Steps, doubts, in_place};
+
+/// Rows of one step of `k` environments in turn are looked for up to this many environments.
+const MOST_ENVIRONMENTS: usize = 1024;
+/// Rows that are looked at for a column's scale.
+const SAMPLE: usize = 20_000;
+
+/// What a file says row by row, before anything is dropped.
+pub(super) struct Table<'a> {
+    pub dim: usize,
+    pub observations: &'a [f32],
+    /// Stored successors, if there are any.
+    pub next_observations: Option<&'a [f32]>,
+    pub terminals: &'a [bool],
+    pub timeouts: Option<&'a [bool]>,
+    /// Steps after which the collector cut an episode.
+    pub limit: Option<usize>,
+}
+
+/// What is made of it.
+#[derive(Debug, PartialEq)]
+pub(super) struct Resolved {
+    pub timeouts: Vec<bool>,
+    /// Rows that stay.
+    pub keep: Vec<bool>,
+    /// Rows whose successor is known. The others are terminal.
+    pub known: Vec<bool>,
+    pub successors: Successors,
+    pub ends: EpisodeEnds,
+    pub dropped: Dropped,
+    pub warnings: Vec<String>,
+}
+
+impl Resolved {
+    fn new(timeouts: Vec<bool>, successors: Successors, ends: EpisodeEnds) -> Self {
+        let (keep, known) = (vec![true; timeouts.len()], vec![true; timeouts.len()]);
+        Self { timeouts, keep, known, successors, ends, dropped: Dropped::default(), warnings: Vec::new() }
+    }
+}
+
+/// Whether two states are the same, up to how they are rounded.
+///
+/// A column's tolerance is a tenth of its median step, at most a hundredth of its spread; or three times what nine tenths of the
+/// successors miss the next row by, at most a fiftieth of its spread; and at least what float32 and six digits leave. A reset that hits the next
+/// state in every column this closely is no break.
+pub(super) struct Continuity<'a> {
+    table: &'a Table<'a>,
+    next: &'a [f32],
+    tolerance: Vec<f32>,
+}
+
+impl<'a> Continuity<'a> {
+    fn new(table: &'a Table<'a>, next: &'a [f32]) -> Self {
+        let (d, n) = (table.dim, table.terminals.len());
+        let sample: Vec<usize> = (0..n).step_by(n.div_ceil(SAMPLE)).collect();
+        let column = |k: usize| {
+            let s = |i: usize| f64::from(table.observations[i * d + k]);
+            let count = sample.len() as f64;
+            let mean = sample.iter().map(|&i| s(i)).sum::<f64>() / count;
+            let spread = (sample.iter().map(|&i| (s(i) - mean).powi(2)).sum::<f64>() / count).sqrt();
+            let largest = sample.iter().map(|&i| s(i).abs()).fold(0.0, f64::max);
+            let mut steps: Vec<f64> = sample.iter().map(|&i| (f64::from(next[i * d + k]) - s(i)).abs()).collect();
+            let middle = steps.len() / 2;
+            let step = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
+            // What nine tenths of the successors miss the next row by is how they were rounded.
+            let miss = |&i: &usize| (f64::from(next[i * d + k]) - f64::from(table.observations[(i + 1) * d + k])).abs();
+            let mut misses: Vec<f64> = sample.iter().filter(|i| **i + 1 < n).map(miss).collect();
+            let at = misses.len() * 9 / 10;
+            let rounding = if misses.is_empty() { 0.0 } else { *misses.select_nth_unstable_by(at, f64::total_cmp).1 };
+            let by_step = (0.1 * step).clamp(1e-4 * spread, 1e-2 * spread);
+            by_step.max((3.0 * rounding).min(2e-2 * spread)).max(2e-6 * largest) as f32
+        };
+        Self { table, next, tolerance: (0..d).map(column).collect() }
+    }
+
+    /// Whether there is a row i + lag and the stored successor of row i is its state.
+    fn joined(&self, i: usize, lag: usize) -> bool {
+        let d = self.table.dim;
+        if i + lag >= self.table.terminals.len() {
+            return false;
+        }
+        let (next, state) =
+            (&self.next[i * d..(i + 1) * d], &self.table.observations[(i + lag) * d..(i + lag + 1) * d]);
+        same_bits(next, state) || next.iter().zip(state).zip(&self.tolerance).all(|((a, b), t)| (a - b).abs() <= *t)
+    }
+
+    /// For every row whether the next one continues it.
+    fn all(&self) -> Vec<bool> {
+        (0..self.table.terminals.len()).into_par_iter().map(|i| self.joined(i, 1)).collect()
+    }
+}
+
+/// Sixteen columns at a time, which takes a few instructions; most rows are joined and have the same bits.
+fn same_bits(a: &[f32], b: &[f32]) -> bool {
+    let differ = |(a, b): (&[f32], &[f32])| a.iter().zip(b).fold(0, |bits, (a, b)| bits | (a.to_bits() ^ b.to_bits()));
+    a.chunks(16).zip(b.chunks(16)).all(|pair| differ(pair) == 0)
+}
+
+/// How many environments take turns in the rows: s'ᵢ is the state of row i + k and not of row i + 1. One, where nothing says
+/// otherwise.
+pub(super) fn environments(table: &Table<'_>) -> usize {
+    let n = table.terminals.len();
+    let Some(next) = table.next_observations else { return 1 };
+    let continuity = Continuity::new(table, next);
+    let sample: Vec<usize> = (0..n).step_by(n.div_ceil(2000)).collect();
+    let share = |lag: usize| {
+        let rows: Vec<_> = sample.iter().filter(|&&i| i + lag < n).collect();
+        rows.iter().filter(|&&&i| continuity.joined(i, lag)).count() as f64 / rows.len().max(1) as f64
+    };
+    if share(1) > 0.5 {
+        return 1;
+    }
+    let lags = 2..=MOST_ENVIRONMENTS.min(n / 2);
+    lags.into_iter().find(|&lag| share(lag) > 0.5).unwrap_or(1)
+}
+
+/// The rows of `n` in the order of `environments` environments, one after the other.
+pub(super) fn untangled(n: usize, environments: usize) -> Vec<usize> {
+    (0..environments).flat_map(|k| (k..n).step_by(environments)).collect()
+}
+
+/// Whether a row that ends no episode has another successor than the next row.
+pub(super) fn has_unmarked_ends(table: &Table<'_>) -> bool {
+    let (Some(next), Some(timeouts)) = (table.next_observations, table.timeouts) else { return true };
+    let continuity = Continuity::new(table, next);
+    let last = table.terminals.len() - 1;
+    (0..last).into_par_iter().any(|i| !table.terminals[i] && !timeouts[i] && !continuity.joined(i, 1))
+}
+
+/// Decides, for rows that are in their order.
+pub(super) fn resolve(table: &Table<'_>, environments: usize) -> Resolved {
+    match (table.next_observations, table.timeouts) {
+        (Some(next), timeouts) => {
+            let mut joined = Continuity::new(table, next).all();
+            cut_between(&mut joined, environments);
+            match timeouts {
+                Some(timeouts) => by_marks(table, timeouts, &joined),
+                None => by_continuity(table, &joined),
+            }
+        }
+        (None, Some(timeouts)) => {
+            let mut warnings = Vec::new();
+            let timeouts = in_place(table, timeouts, &mut warnings);
+            let mut out = next_rows(table, timeouts, EpisodeEnds::Marks);
+            warnings.extend(doubts(table, &out));
+            out.warnings.splice(0..0, warnings);
+            out
+        }
+        (None, None) => {
+            let ends = table.limit.map_or(EpisodeEnds::Terminals, EpisodeEnds::StepLimit);
+            let warning = match table.limit {
+                Some(n) => format!("no `timeouts` field: episodes are taken to end after {n} steps or at a terminal"),
+                None => {
+                    "neither `timeouts` nor `next_observations`: episodes are taken to end at terminals only".into()
+                }
+            };
+            let mut out = next_rows(table, count_timeouts(table.terminals, table.limit), ends);
+            out.warnings.insert(0, warning);
+            out.warnings.extend(doubts(table, &out));
+            out
+        }
+    }
+}
+
+/// The last rows of environments that were put one after the other are followed by another one's rows.
+fn cut_between(joined: &mut [bool], environments: usize) {
+    let n = joined.len();
+    let mut end = 0;
+    for k in 0..environments {
+        end += (n - k).div_ceil(environments);
+        joined[end - 1] = false;
+    }
+}
+
+/// A file with stored successors and `timeouts`.
+fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
+    let last = table.terminals.len() - 1;
+    let rows_of = |what: &dyn Fn(usize) -> bool| (0..last).filter(|&i| what(i)).collect::<Vec<_>>();
+    let ended = |i: usize| table.terminals[i] || timeouts[i];
+    let ends = rows_of(&ended);
+    let joined_ends = rows_of(&|i| ended(i) && joined[i]);
+    let joined_timeouts = rows_of(&|i| timeouts[i] && !table.terminals[i] && joined[i]);
+    let breaks = rows_of(&|i| !ended(i) && !joined[i]);
+    // Only doubtful files are measured.
+    let steps = LazyCell::new(|| Steps::new(table));
+    if breaks.len() * 2 > last.max(1) && steps.in_order() {
+        let mut out = Resolved::new(timeouts.to_vec(), Successors::Stored, EpisodeEnds::Marks);
+        out.warnings.push(elsewhere(breaks.len(), last));
+        return out;
+    }
+    if breaks.len() * 2 > last.max(1) {
+        let mut out = Resolved::new(timeouts.to_vec(), Successors::Stored, EpisodeEnds::NoOrder);
+        breaks.iter().for_each(|&i| out.timeouts[i] = true);
+        out.warnings.push(no_order(breaks.len(), last));
+        return out;
+    }
+    // Successors built as the next row are that at every end, nowhere does anything else end, and the step there is none of the robot's.
+    let many = joined_ends.len() * 10 > last.max(10);
+    if joined_ends.len() * 2 > ends.len()
+        && breaks.len() * 4 < joined_ends.len()
+        && !many
+        && steps.jump_at(&joined_ends)
+    {
+        let mut out = rebuilt(table, timeouts, joined);
+        breaks.iter().for_each(|&i| out.timeouts[i] = true);
+        return out;
+    }
+    let marks = rows_of(&|i| timeouts[i]);
+    let mut out = Resolved::new(timeouts.to_vec(), Successors::Stored, EpisodeEnds::Marks);
+    if (0..last).all(|i| joined[i]) {
+        // Such successors tell nothing that the next rows do not.
+        let moved = in_place(table, timeouts, &mut out.warnings);
+        if moved != timeouts {
+            let mut told = std::mem::take(&mut out.warnings);
+            let mut out = rebuilt(table, &moved, joined);
+            told.append(&mut out.warnings);
+            return Resolved { warnings: told, ..out };
+        }
+        let doubts = doubts(table, &out);
+        out.warnings.extend(doubts);
+    }
+    if !breaks.is_empty() && joined_timeouts.len() * 2 > marks.len() {
+        joined_timeouts.iter().for_each(|&i| out.timeouts[i] = false);
+        out.ends = EpisodeEnds::Continuity;
+        out.warnings.push(format!(
+            "`timeouts` contradicts the states: it marks {}, which the next row continues, and not {}, where s' is not the next row's \
+             state. Episodes end where the states say; correct `timeouts` (is it shifted?)",
+            tell(&joined_timeouts),
+            tell(&breaks)
+        ));
+    } else if !breaks.is_empty() {
+        // A mark one row from where an episode visibly ends is that end's.
+        let beside = |i: &&usize| {
+            breaks.binary_search(&(**i + 1)).is_ok() || **i > 0 && breaks.binary_search(&(**i - 1)).is_ok()
+        };
+        let displaced: Vec<usize> = joined_timeouts.iter().filter(beside).copied().collect();
+        if !displaced.is_empty() {
+            displaced.iter().for_each(|&i| out.timeouts[i] = false);
+            out.warnings.push(format!(
+                "`timeouts` marks {}, which the next row continues, one row from an end: the marks were moved",
+                tell(&displaced)
+            ));
+        }
+        if marks.is_empty() {
+            out.ends = EpisodeEnds::Continuity;
+        }
+        out.warnings.push(format!(
+            "`timeouts` does not mark {}, where s' is not the next row's state: episodes end there, too",
+            tell(&breaks)
+        ));
+    }
+    breaks.iter().for_each(|&i| out.timeouts[i] = true);
+    out.warnings.extend(displaced_terminals(table, joined));
+    out.warnings.extend(held_terminals(table, joined));
+    out
+}
+
+/// Told where a terminal row is followed by its own successor, which is terminal as well.
+fn held_terminals(table: &Table<'_>, joined: &[bool]) -> Option<String> {
+    let t = table.terminals;
+    let held: Vec<usize> = (0..t.len().saturating_sub(1)).filter(|&i| t[i] && t[i + 1] && joined[i]).collect();
+    (!held.is_empty()).then(|| {
+        format!(
+            "`terminals` stays true after {}: nothing is bootstrapped there, and each such row is an episode; a terminal is the row in which \
+             the episode ends",
+            tell(&held)
+        )
+    })
+}
+
+fn elsewhere(breaks: usize, n: usize) -> String {
+    format!(
+        "the stored next_observations are not the next row's state in {breaks} of {n} rows, although the rows are in order (other digits, other \
+         columns, or some steps later?): they are used as they are, and episodes end where the file marks it"
+    )
+}
+
+/// A file whose stored successors are the next row's state even where an episode ends: there, nobody knows them.
+fn rebuilt(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
+    let last = table.terminals.len() - 1;
+    let mut out = Resolved::new(timeouts.to_vec(), Successors::NextRow, EpisodeEnds::Marks);
+    for i in 0..=last {
+        let unknown = i == last || (joined[i] && (table.terminals[i] || timeouts[i]));
+        if unknown && table.terminals[i] {
+            out.known[i] = false;
+        } else if unknown {
+            out.keep[i] = false;
+            *(if i == last { &mut out.dropped.last_row } else { &mut out.dropped.time_out }) += 1;
+        }
+    }
+    out.warnings.push(
+        "the stored next_observations are the following row's state even where an episode ends; there they are treated as absent"
+            .into(),
+    );
+    out
+}
+
+/// A file with stored successors and without `timeouts`.
+///
+/// An episode ends at a terminal, after `limit` steps, where s'ᵢ ≠ sᵢ₊₁, and at the last row. Where the stored successor of a row that
+/// ended by a terminal or by the limit is the following row's state, it was built as sᵢ₊₁ and is the next episode's first state;
+/// then a last row that ended so has one that was made up in some other way.
+fn by_continuity(table: &Table<'_>, joined: &[bool]) -> Resolved {
+    let n = table.terminals.len();
+    let breaks = (0..n - 1).filter(|&i| !joined[i] && !table.terminals[i]).count();
+    let displaced = displaced_terminals(table, joined);
+    // Only doubtful files are measured.
+    let steps = LazyCell::new(|| Steps::new(table));
+    if breaks * 2 > n && steps.in_order() {
+        let mut out = Resolved::new(vec![false; n], Successors::Stored, EpisodeEnds::Terminals);
+        out.warnings.push(elsewhere(breaks, n));
+        return out;
+    }
+    let joined_terminals: Vec<usize> = (0..n - 1).filter(|&i| table.terminals[i] && joined[i]).collect();
+    let rebuilt = displaced.is_none()
+        && !joined_terminals.is_empty()
+        && joined_terminals.len() * 10 <= n.max(10)
+        && steps.jump_at(&joined_terminals);
+    let mut out = Resolved::new(vec![false; n], Successors::Stored, EpisodeEnds::Continuity);
+    let (mut any, mut start) = (false, 0);
+    for (i, &continues) in joined.iter().enumerate() {
+        let by_limit = Some(i + 1 - start) == table.limit;
+        // Where the step after a terminal is one of the robot's, its successor is right.
+        let over = by_limit || (table.terminals[i] && rebuilt);
+        if over || table.terminals[i] || !continues {
+            out.timeouts[i] = !table.terminals[i];
+            start = i + 1;
+        }
+        let wrong = over && (continues || (i + 1 == n && any));
+        any |= wrong;
+        match (wrong, table.terminals[i]) {
+            (true, true) => out.known[i] = false,
+            (true, false) => {
+                out.keep[i] = false;
+                out.dropped.wrong_successor += 1;
+            }
+            (false, _) => {}
+        }
+    }
+    if (0..n - 1).all(|i| joined[i]) {
+        let doubts = doubts(table, &out);
+        out.warnings.extend(doubts);
+    }
+    if breaks * 2 > n {
+        out.ends = EpisodeEnds::NoOrder;
+        out.warnings.push(no_order(breaks, n));
+    }
+    out.warnings.extend(displaced);
+    out.warnings.extend(held_terminals(table, joined));
+    out
+}
+
+/// Told where most terminals are followed by their own successor, while an episode visibly ends in the row before or after.
+fn displaced_terminals(table: &Table<'_>, joined: &[bool]) -> Option<String> {
+    let last = table.terminals.len() - 1;
+    let terminals: Vec<usize> = (0..last).filter(|&i| table.terminals[i]).collect();
+    let ends = |i: usize| i < last && !table.terminals[i] && !joined[i];
+    let displaced: Vec<usize> =
+        terminals.iter().copied().filter(|&i| joined[i] && (ends(i + 1) || (i > 0 && ends(i - 1)))).collect();
+    (!displaced.is_empty() && displaced.len() * 2 > terminals.len()).then(|| {
+        format!(
+            "`terminals` contradicts the states: it marks {}, which the next row continues, while an episode ends one row away. \
+             The flags are used as they are; correct `terminals` (is it shifted?)",
+            tell(&displaced)
+        )
+    })
+}
+
+fn no_order(breaks: usize, n: usize) -> String {
+    format!(
+        "the rows are in no order: s' is not the next row's state in {breaks} of {n} rows. Single transitions are used as they are; what \
+         follows episodes (returns, the better trajectories, sequence models) cannot be told from this file"
+    )
+}
+
+/// D4RL's `qlearning_dataset` for files without successors: s'ᵢ = sᵢ₊₁. Time-out rows have none and are dropped, with the last row.
+/// Terminal rows have none either, but nothing is bootstrapped there: they stay, marked.
+fn next_rows(table: &Table<'_>, timeouts: Vec<bool>, ends: EpisodeEnds) -> Resolved {
+    let last = timeouts.len() - 1;
+    let mut out = Resolved::new(timeouts, Successors::NextRow, ends);
+    for i in 0..=last {
+        if table.terminals[i] {
+            out.known[i] = false;
+            out.timeouts[i] = false;
+        } else if i == last || out.timeouts[i] {
+            out.keep[i] = false;
+            *(if i == last { &mut out.dropped.last_row } else { &mut out.dropped.time_out }) += 1;
+        }
+    }
+    out
+}
+
+/// Rows after which an episode was cut by the step limit, for a file that has neither `timeouts` nor `next_observations`: D4RL counts
+/// steps.
+fn count_timeouts(terminals: &[bool], limit: Option<usize>) -> Vec<bool> {
+    let mut steps = 0;
+    let full = |&terminal: &bool| {
+        steps += 1;
+        let full = Some(steps) == limit;
+        if terminal || full {
+            steps = 0;
+        }
+        full
+    };
+    terminals.iter().map(full).collect()
+}

@@ -1,0 +1,176 @@
+//! Files with one data set a field: D4RL's, OTDF's, and what [`save_d4rl`](super::save_d4rl) writes.
+//!
+//! | field | shape | also read under |
+//! |---|---|---|
+//! | `observations` | (N, D) | `obs`, `states` |
+//! | `actions` | (N, A) | `action` |
+//! | `rewards` | (N,) or (N, 1) | `reward` |
+//! | `next_observations` | (N, D), may be absent | `next_obs`, `next_states` |
+//! | `terminals` | (N,) or (N, 1) | `terminations`, `terminated`, `terminal` |
+//! | `timeouts` | (N,) or (N, 1), may be absent | `truncations`, `truncated`, `truncateds`, `timeout`, `infos/timeouts` |
+
+use std::collections::BTreeMap;
+
+use super::formats::{Format, Raw};
+use super::hdf5::{Column, Hdf5};
+use super::load::LoadOptions;
+use super::report::Layout;
+use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
+use crate::{DataError, Problem};
+
+/// See the [module](self).
+pub(super) struct Flat;
+
+const OBSERVATIONS: [&str; 3] = ["observations", "obs", "states"];
+const ACTIONS: [&str; 2] = ["actions", "action"];
+const REWARDS: [&str; 2] = ["rewards", "reward"];
+const NEXT: [&str; 3] = ["next_observations", "next_obs", "next_states"];
+const TERMINALS: [&str; 4] = ["terminals", "terminations", "terminated", "terminal"];
+const TIMEOUTS: [&str; 6] = ["timeouts", "truncations", "truncated", "truncateds", "timeout", "infos/timeouts"];
+/// What ends episodes, and does not tell how.
+const ANY_END: [&str; 5] = ["dones", "done", "dones_float", "episode_terminals", "ends"];
+/// What may tell where episodes end, and is not read.
+const HINTS: [&str; 6] =
+    ["infos/TimeLimit.truncated", "infos/truncated", "infos/truncations", "truncation", "episode_id", "episode_ids"];
+
+/// The first of `names` that the file has, with a word to the user where it is not the first one.
+fn name<'a>(file: &Hdf5, names: &[&'a str], warnings: &mut Vec<String>) -> Option<&'a str> {
+    let found = *names.iter().find(|name| file.has(name))?;
+    if found != names[0] {
+        warnings.push(format!("no `{}`: `{found}` was read as such", names[0]));
+    }
+    Some(found)
+}
+
+impl Format for Flat {
+    fn recognises(&self, _file: &Hdf5) -> bool {
+        true
+    }
+
+    fn read(&self, file: &Hdf5, options: &LoadOptions) -> Result<Raw, DataError> {
+        let mut warnings = Vec::new();
+        let mut field = |names: &[&'static str]| name(file, names, &mut warnings);
+        let mut needed = |names: &[&'static str]| field(names).ok_or_else(|| file.missing(names[0]));
+        let (observations, actions, rewards) = (needed(&OBSERVATIONS)?, needed(&ACTIONS)?, needed(&REWARDS)?);
+        let (next, terminals, timeouts) = (field(&NEXT), field(&TERMINALS), field(&TIMEOUTS));
+        let terminals = terminals.ok_or_else(|| without_terminals(file))?;
+        let other_marks = |name: &&&str| file.has(name) && Some(**name) != timeouts;
+        for name in TIMEOUTS.iter().filter(other_marks).filter(|_| timeouts.is_some()) {
+            warnings.push(format!("`{name}` was not read, because `{}` is there", timeouts.unwrap_or_default()));
+        }
+        for name in ANY_END.iter().chain(&HINTS).filter(|name| timeouts.is_none() && file.has(name)) {
+            warnings.push(format!("`{name}` was not read; if it tells where episodes end, store it as `timeouts`"));
+        }
+
+        let (mut stored, mut observed) = (None, None);
+        // The two large columns are inflated side by side, each through a handle of its own.
+        rayon::scope(|s| {
+            if let Some(next) = next {
+                s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix(next))));
+            }
+            observed = Some(file.matrix(observations));
+        });
+        let observed = observed.expect("the scope has run")?;
+        let stored = stored.transpose()?;
+        let (acted, rewarded) = (file.matrix(actions)?, file.vector(rewards)?);
+        let terminal = file.flags(terminals)?;
+        let timeout = timeouts.map(|name| file.flags(name)).transpose()?;
+        let known = if file.has(KNOWN) { Some(file.flags(KNOWN)?) } else { None };
+        let columns = further(
+            file,
+            options,
+            &[observations, actions, rewards, terminals],
+            next,
+            timeouts,
+            observed.rows,
+            &mut warnings,
+        )?;
+
+        let rows = observed.rows;
+        let mut counts = vec![(actions, acted.rows), (rewards, rewarded.rows), (terminals, terminal.len())];
+        counts.extend(next.zip(stored.as_ref()).map(|(name, c)| (name, c.rows)));
+        counts.extend(timeouts.zip(timeout.as_ref()).map(|(name, t)| (name, t.len())));
+        counts.extend(known.as_ref().map(|k| (KNOWN, k.len())));
+        counts.extend(columns.iter().map(|(k, v)| (k.as_str(), v.len())));
+        if let Some((name, n)) = counts.iter().find(|c| c.1 != rows) {
+            let expected = format!("{rows} rows, as in `{observations}`");
+            let advice = "The fields must have one row per transition: write the file again";
+            return Err(file.invalid(Problem::RowCount, name, format!("{n} rows"), expected, advice));
+        }
+        if let Some((name, c)) = next.zip(stored.as_ref()).filter(|(_, c)| c.dim != observed.dim) {
+            let advice = "A state and its successor have the same dimension: write the file again";
+            let expected = format!("{} columns, as in `{observations}`", observed.dim);
+            return Err(file.invalid(Problem::Dimension, name, format!("{} columns", c.dim), expected, advice));
+        }
+        if observed.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
+            warnings.push("states are stored as float64; they were rounded to float32".to_owned());
+        }
+        let trusted = file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT);
+        let layout = match (trusted, &stored, &timeout) {
+            (true, Some(_), Some(_)) => Layout::Tce,
+            (_, Some(_), None) => Layout::Otdf,
+            _ => Layout::D4rl,
+        };
+        Ok(Raw {
+            layout,
+            obs_dim: observed.dim,
+            act_dim: acted.dim,
+            observations: observed.data,
+            actions: acted.data,
+            rewards: rewarded.data,
+            next_observations: stored.map(|c: Column| c.data),
+            terminals: terminal,
+            timeouts: timeout,
+            known,
+            columns,
+            warnings,
+        })
+    }
+}
+
+/// The columns that were asked for; all there are, if all were, with a word about those that cannot be read.
+fn further(
+    file: &Hdf5,
+    options: &LoadOptions,
+    fields: &[&str],
+    next: Option<&str>,
+    timeouts: Option<&str>,
+    rows: usize,
+    warnings: &mut Vec<String>,
+) -> Result<BTreeMap<String, Vec<f32>>, DataError> {
+    let mut columns = BTreeMap::new();
+    for name in &options.columns {
+        columns.insert(name.clone(), file.vector(name)?.data);
+    }
+    if options.all_columns {
+        let read = |name: &str| fields.contains(&name) || next == Some(name) || timeouts == Some(name) || name == KNOWN;
+        let mut left_out = Vec::new();
+        for name in file.all_datasets()?.into_iter().filter(|name| !read(name)) {
+            match file.vector(&name) {
+                Ok(column) if column.rows == rows && name.matches('/').count() <= 1 => {
+                    drop(columns.insert(name, column.data))
+                }
+                _ => left_out.push(name),
+            }
+        }
+        if !left_out.is_empty() {
+            warnings.push(format!("not read, because they are no columns of {rows} numbers: {}", left_out.join(", ")));
+        }
+    }
+    Ok(columns)
+}
+
+fn without_terminals(file: &Hdf5) -> DataError {
+    match ANY_END.into_iter().find(|name| file.has(name)) {
+        Some(name) => file.invalid(
+            Problem::MissingField,
+            "terminals",
+            format!("`{name}`, which does not tell terminals from time-outs"),
+            "`terminals`: true where the robot cannot go on; and `timeouts`: true where the episode was cut",
+            format!(
+                "Store both; where no episode ends by itself, all `terminals` are false and `{name}` is `timeouts`"
+            ),
+        ),
+        None => file.missing("terminals"),
+    }
+}

@@ -1,0 +1,101 @@
+//! From [`Transitions`] to a folder that `minari.load_dataset` reads.
+
+use std::path::Path;
+
+use hdf5_pure::{AttrValue, EnumTypeBuilder, FileBuilder, make_i8_type};
+use tce_base::{AtomicFile, AtomicFolder, write_json};
+
+use super::save::finish;
+use crate::{ActionRange, DataError, Problem, Transitions};
+
+/// Read by Minari 0.5.
+const VERSION: &str = "0.5.0";
+
+/// Writes `data` as the Minari data set `id` (`robot/task-v0`) into the folder `path`: `data/main_data.hdf5` and `data/metadata.json`.
+/// Minari finds it where `path` is its `MINARI_DATASETS_PATH` followed by `id`. Every episode is a group; an episode without order, such
+/// as a generated row, is one of a single step. `range` is that of the action space; None: [-1, 1].
+///
+/// The folder is complete or absent; nothing that is there is replaced.
+///
+/// # Errors
+/// No rows; an episode whose rows do not follow each other; a folder that is there; a full disk.
+pub fn save_minari(path: &Path, id: &str, data: &Transitions, range: Option<&ActionRange>) -> Result<(), DataError> {
+    let refuse = |found: String, expected: &str| {
+        let advice = "Nothing was written; choose another name, or remove what is there";
+        Err(DataError::invalid(Problem::Value, path, "file", found, expected, advice))
+    };
+    if path.exists() {
+        return refuse("something is there already".into(), "a new folder");
+    }
+    if data.is_empty() {
+        return refuse("no rows to write".into(), "at least one row");
+    }
+    let whole = AtomicFolder::create(path)?;
+    let folder = whole.path().join("data");
+
+    let mut builder = FileBuilder::new();
+    let boolean = EnumTypeBuilder::with_base(make_i8_type())
+        .u8_value("FALSE", 0)
+        .u8_value("TRUE", 1)
+        .build()
+        .expect("a constant type");
+    let (d, a) = (data.obs_dim, data.act_dim);
+    let episodes = data.episodes();
+    for (k, e) in episodes.iter().enumerate() {
+        let (rows, n) = (e.start..e.end, e.end - e.start);
+        let mut states = data.observations[e.start * d..e.end * d].to_vec();
+        states.extend_from_slice(data.next_observation(e.end - 1));
+        let mut group = builder.create_group(&format!("episode_{k}"));
+        group.set_attr("id", AttrValue::I64(k as i64));
+        group.set_attr("total_steps", AttrValue::I64(n as i64));
+        group.create_dataset("observations").with_f32_data(&states).with_shape(&[n as u64 + 1, d as u64]);
+        let actions = &data.actions[e.start * a..e.end * a];
+        group.create_dataset("actions").with_f32_data(actions).with_shape(&[n as u64, a as u64]);
+        group.create_dataset("rewards").with_f32_data(&data.rewards[rows.clone()]);
+        let truncations: Vec<bool> = rows.clone().map(|i| i + 1 == e.end && !data.terminals[i]).collect();
+        for (name, flags) in [("terminations", &data.terminals[rows]), ("truncations", &truncations)] {
+            let bytes = flags.iter().map(|&f| u8::from(f)).collect();
+            group.create_dataset(name).with_raw_data(boolean.clone(), bytes, n as u64);
+        }
+        builder.add_group(group.finish());
+    }
+    let mut file = AtomicFile::create(&folder.join("main_data.hdf5"))?;
+    finish(builder, file.file(), path)?;
+    file.commit()?;
+    let (low, high) = match range {
+        Some(range) => (range.low.clone(), range.high.clone()),
+        None => (vec![-1.0; a], vec![1.0; a]),
+    };
+    write_json(
+        &folder.join("metadata.json"),
+        &serde_json::json!({
+            "total_episodes": episodes.len(),
+            "total_steps": data.len(),
+            "data_format": "hdf5",
+            "jpeg_encoding": false,
+            "observation_space": space(&vec!["-Infinity"; d], &vec!["Infinity"; d]),
+            "action_space": space(&words(&low), &words(&high)),
+            "dataset_size": data.len() as f64 * (d + a + 2) as f64 * 4e-6,
+            "dataset_id": id,
+            "algorithm_name": "tce",
+            "minari_version": VERSION,
+        }),
+    )?;
+    Ok(whole.commit()?)
+}
+
+fn words(values: &[f32]) -> Vec<String> {
+    values.iter().map(|v| format!("{v:?}")).collect()
+}
+
+/// A Box of float32, as Minari's `serialize_space` writes it: JSON with Python's `Infinity`.
+fn space(low: &[impl AsRef<str>], high: &[impl AsRef<str>]) -> String {
+    let list = |v: &[&str]| v.join(", ");
+    let (n, low): (usize, Vec<&str>) = (low.len(), low.iter().map(AsRef::as_ref).collect());
+    let high: Vec<&str> = high.iter().map(AsRef::as_ref).collect();
+    format!(
+        r#"{{"type": "Box", "dtype": "float32", "shape": [{n}], "low": [{}], "high": [{}]}}"#,
+        list(&low),
+        list(&high)
+    )
+}

@@ -1,0 +1,139 @@
+//! How far a state is from the next one: what tells where episodes end in files that hold no successors, or none that tell anything.
+
+use super::episodes::{Resolved, Table};
+use super::rows::tell;
+
+/// The steps from row to row, in units of the columns' spreads.
+pub(super) struct Steps<'a> {
+    table: &'a Table<'a>,
+    lengths: Vec<f32>,
+    median: f32,
+}
+
+impl<'a> Steps<'a> {
+    pub fn new(table: &'a Table<'a>) -> Self {
+        let lengths = step_lengths(table.observations, table.dim);
+        let median = median(lengths.iter().copied());
+        Self { table, lengths, median }
+    }
+
+    /// Whether the state jumps after these rows, as it does where another episode begins. On the public sets such steps are 1.8 to 56 times
+    /// the usual one.
+    pub fn jump_at(&self, rows: &[usize]) -> bool {
+        // One or two ends may be long steps by chance.
+        let jump = if rows.len() < 3 { 3.0 * JUMP } else { JUMP };
+        median(rows.iter().map(|&i| self.lengths[i])) > jump * self.median
+    }
+
+    /// Whether a row is much closer to the next one than to any other. (At HalfCheetah's pace it is not.)
+    pub fn in_order(&self) -> bool {
+        let d = self.table.dim;
+        let n = self.table.terminals.len();
+        // A stride that hits no short period.
+        let far = (n as f64 * 0.381_966) as usize;
+        let rows: Vec<f32> =
+            (0..n).flat_map(|i| self.table.observations[((i + i * far) % n) * d..][..d].iter().copied()).collect();
+        let apart = median(step_lengths(&rows, d).into_iter());
+        self.median < 0.6 * apart
+    }
+}
+
+/// By how much a step into another episode is longer than the usual one, in the middle.
+const JUMP: f32 = 1.4;
+
+/// `timeouts` of a file without successors, one row earlier or later where the states jump there and not at the marks.
+pub(super) fn in_place(table: &Table<'_>, timeouts: &[bool], warnings: &mut Vec<String>) -> Vec<bool> {
+    let n = timeouts.len();
+    let reach = FURTHEST as usize;
+    let marks: Vec<usize> = (reach..n.saturating_sub(reach + 1)).filter(|&i| timeouts[i]).collect();
+    if marks.len() < 3 {
+        return timeouts.to_vec();
+    }
+    let steps = Steps::new(table);
+    let at = |shift: isize| median(marks.iter().map(|&i| steps.lengths[i.wrapping_add_signed(shift)]));
+    let here = at(0);
+    let (there, shift) =
+        (-FURTHEST..=FURTHEST).map(|s| (at(s), s)).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((here, 0));
+    if there <= 4.0 * here || there <= 4.0 * steps.median {
+        return timeouts.to_vec();
+    }
+    warnings.push(format!(
+        "`timeouts` contradicts the states: it marks {}, but the states jump {} {}. Episodes end where they jump; correct `timeouts`",
+        tell(&marks),
+        if shift.abs() == 1 { "one row".into() } else { format!("{} rows", shift.abs()) },
+        if shift < 0 { "before" } else { "after" }
+    ));
+    (0..n).map(|i| i.checked_add_signed(-shift).and_then(|j| timeouts.get(j)).copied().unwrap_or(false)).collect()
+}
+
+/// Marks are looked for up to this many rows from where the states jump.
+const FURTHEST: isize = 5;
+
+/// Told of a file without successors: rows after which the state jumps, and no episode ends; rows of several environments in turn.
+pub(super) fn doubts(table: &Table<'_>, out: &Resolved) -> Vec<String> {
+    let steps = Steps::new(table);
+    let ended = |i: usize| table.terminals[i] || out.timeouts[i];
+    let mut told = Vec::new();
+    let jumps = jumps(&steps.lengths, &ended);
+    if !jumps.is_empty() {
+        told.push(format!(
+            "the state jumps after {}, far more than in a usual step, and no episode ends there: their s' is another episode's first state, if a \
+             `timeouts` is missing or in other rows. Store `timeouts`, or `next_observations`",
+            tell(&jumps)
+        ));
+    }
+    let (d, n) = (table.dim, table.terminals.len());
+    let apart = |lag: usize| {
+        let rows = (0..n - lag).step_by((n - lag).div_ceil(2000));
+        let pair = |i: usize| {
+            let (a, b) = (&table.observations[i * d..][..d], &table.observations[(i + lag) * d..][..d]);
+            a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
+        };
+        median(rows.map(pair))
+    };
+    if n > 1000 && !steps.in_order() {
+        let near = apart(1);
+        // In squares: a third of the distance.
+        if let Some(k) = (2..=64).find(|&lag| apart(lag) < 0.1 * near) {
+            told.push(format!(
+                "states {k} rows apart are much closer than neighbours: do the rows of {k} environments take turns? Then every s' is another \
+                 environment's. Store `next_observations`, or write one environment after the other (a gait of {k} steps looks the same)"
+            ));
+        }
+    }
+    told
+}
+
+/// Rows that do not end an episode and after which the state jumps: by more than 8 usual steps and 5 times what 95 % of the steps are, at
+/// least three of them. The contacts of walking robots stay below that.
+fn jumps(lengths: &[f32], ended: &dyn Fn(usize) -> bool) -> Vec<usize> {
+    let mut usual: Vec<f32> = (0..lengths.len()).filter(|&i| !ended(i)).map(|i| lengths[i]).collect();
+    if usual.len() < 100 {
+        return Vec::new();
+    }
+    let at = usual.len() * 95 / 100;
+    let high = *usual.select_nth_unstable_by(at, f32::total_cmp).1;
+    let bound = (8.0 * median(usual.into_iter())).max(5.0 * high);
+    let rows: Vec<usize> = (0..lengths.len()).filter(|&i| bound > 0.0 && !ended(i) && lengths[i] > bound).collect();
+    if rows.len() >= 3 { rows } else { Vec::new() }
+}
+
+/// The length of the step from each row to the next, in units of the columns' spreads.
+fn step_lengths(observations: &[f32], dim: usize) -> Vec<f32> {
+    let moments = crate::moments::Moments::of(&[crate::Rows::new(observations, dim)]);
+    let scale: Vec<f32> = moments.std.iter().map(|&s| if s > 0.0 { 1.0 / s as f32 } else { 0.0 }).collect();
+    let pairs = observations.chunks_exact(dim).zip(observations.chunks_exact(dim).skip(1));
+    let length = |(a, b): (&[f32], &[f32])| {
+        a.iter().zip(b).zip(&scale).map(|((a, b), s)| ((b - a) * s).powi(2)).sum::<f32>().sqrt()
+    };
+    pairs.map(length).collect()
+}
+
+fn median(values: impl Iterator<Item = f32>) -> f32 {
+    let mut values: Vec<f32> = values.collect();
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
