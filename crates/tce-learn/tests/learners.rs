@@ -52,7 +52,7 @@ fn cloning_learns_a_linear_policy() {
     let data = linear_data();
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 64).unwrap();
     let actor = ActorConfig { hidden: vec![32, 32], lr: 3e-3, ..ActorConfig::default() };
-    let config = BcConfig { actor, ensemble: 1 };
+    let config = BcConfig { actor, ..BcConfig::default() };
     let mut bc = Bc::new(&buffer, &config, 1500, &cpu()).unwrap();
     let report = run(&mut bc, &buffer, 1500);
     assert_eq!(report.step, 1500);

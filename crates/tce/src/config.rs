@@ -152,7 +152,7 @@ pub struct UntilDoneConfig {
 
 impl Default for UntilDoneConfig {
     fn default() -> Self {
-        Self { first: 7_500, state_limit: 60_000, transition_limit: 120_000, gain: 0.1, held_out: 0.05 }
+        Self { first: 7_500, state_limit: 60_000, transition_limit: 240_000, gain: 0.1, held_out: 0.05 }
     }
 }
 
@@ -394,6 +394,14 @@ impl LearnerConfig {
         match self.algorithm {
             Algorithm::Dmc => self.dmc.behaviour(&self.behaviour),
             _ => self.behaviour.clone(),
+        }
+    }
+
+    /// Training steps, by whether there are rows besides the target's.
+    pub fn steps(&self, mixed: bool) -> u64 {
+        match self.algorithm {
+            Algorithm::Bc => self.bc.steps(self.steps, mixed),
+            _ => self.steps,
         }
     }
 

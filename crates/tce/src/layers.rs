@@ -267,6 +267,19 @@ mod tests {
     }
 
     #[test]
+    fn mixtures_are_cloned_for_fewer_steps() {
+        let mut learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;
+        assert_eq!((learner.algorithm, learner.steps(false), learner.steps(true)), (Algorithm::Bc, 50_000, 15_000));
+        learner.steps = 300;
+        assert_eq!(learner.steps(true), 300, "it is no more than was asked for");
+        learner.steps = 50_000;
+        learner.algorithm = Algorithm::Iql;
+        assert_eq!(learner.steps(true), 50_000, "clones alone");
+        let paper = layered(Preset::Paper, None, &["learner.algorithm=bc"]).unwrap().config().unwrap().learner;
+        assert_eq!(paper.steps(true), paper.steps);
+    }
+
+    #[test]
     fn every_preset_is_a_whole_configuration() {
         for preset in [Preset::Paper, Preset::Default, Preset::Quick] {
             let config = layered(preset, None, &[]).unwrap().config().unwrap();

@@ -88,6 +88,8 @@ pub fn learn(
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<Learned> {
     let started = std::time::Instant::now();
+    let mixed = data.iter().any(|d| d.extra.is_some());
+    let config = &LearnerConfig { steps: config.steps(mixed), ..config.clone() };
     let journal = Journal::default();
     let place = Place { directory: Some(directory), key, lane: 0, journal: Some(&journal) };
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
