@@ -323,6 +323,23 @@ fn a_terminal_row_without_a_successor_is_learned_from_and_its_dynamics_are_not()
     assert_eq!(tce_data::load(&path, &LoadOptions::default()).unwrap().transitions, *t);
 }
 
+/// Some loggers write NaN where an episode ended for good.
+#[test]
+fn a_successor_that_is_no_number_is_not_known_where_it_is_not_needed() {
+    let mut walks = Walks::new();
+    for row in [499, 1299] {
+        walks.terminals[row] = true;
+        walks.timeouts.as_mut().unwrap()[row] = false;
+        walks.next.as_mut().unwrap()[3 * row] = f32::NAN;
+    }
+    for timeouts in [walks.timeouts.clone(), None] {
+        let got = Walks { timeouts, ..walks.clone() }.read();
+        assert_eq!((got.report.rows_kept, got.report.unknown_successors, spans(&got.transitions)), (ROWS, 2, right()));
+        assert!(got.transitions.next_observations.iter().all(|x| x.is_finite()));
+        assert!(got.report.to_string().contains("is not finite in 2 terminal rows"), "{}", got.report);
+    }
+}
+
 #[test]
 fn shifted_marks_show_in_files_without_successors_too() {
     for by in [1, -1] {

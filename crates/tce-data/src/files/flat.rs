@@ -66,12 +66,12 @@ impl Format for Flat {
         // The two large columns are inflated side by side, each through a handle of its own.
         rayon::scope(|s| {
             if let Some(next) = next {
-                s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix(next))));
+                s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix_with_gaps(next))));
             }
             observed = Some(file.matrix(observations));
         });
         let observed = observed.expect("the scope has run")?;
-        let stored = stored.transpose()?;
+        let mut stored = stored.transpose()?;
         let (acted, rewarded) = (file.matrix(actions)?, file.vector(rewards)?);
         let terminal = file.flags(terminals)?;
         let timeout = timeouts.map(|name| file.flags(name)).transpose()?;
@@ -101,6 +101,27 @@ impl Format for Flat {
             let advice = "A state and its successor have the same dimension: write the file again";
             let expected = format!("{} columns, as in `{observations}`", observed.dim);
             return Err(file.invalid(Problem::Dimension, name, format!("{} columns", c.dim), expected, advice));
+        }
+        let mut known = known;
+        if let Some((name, c)) = next.zip(stored.as_mut()) {
+            let gaps: Vec<usize> =
+                (0..rows).filter(|i| c.data[i * c.dim..(i + 1) * c.dim].iter().any(|x| !x.is_finite())).collect();
+            if gaps.iter().any(|&i| !terminal[i]) {
+                // The plain reading says where and what.
+                file.matrix(name)?;
+            }
+            if !gaps.is_empty() {
+                warnings.push(format!(
+                    "`{name}` is not finite in {} terminal rows, whose next state is taken as not known",
+                    gaps.len()
+                ));
+                let known = known.get_or_insert_with(|| vec![true; rows]);
+                for i in gaps {
+                    known[i] = false;
+                    let state = &observed.data[i * c.dim..(i + 1) * c.dim];
+                    c.data[i * c.dim..(i + 1) * c.dim].copy_from_slice(state);
+                }
+            }
         }
         if observed.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
             warnings.push("states are stored as float64; they were rounded to float32".to_owned());

@@ -166,7 +166,9 @@ fn settle(
         ));
         reorder(t, columns, &episodes::untangled(rows, environments));
     }
-    let out = episodes::resolve(&table(t, limit), environments);
+    let mut out = episodes::resolve(&table(t, limit), environments);
+    // What the file itself does not know stays so.
+    out.known.iter_mut().zip(&t.known).for_each(|(known, said)| *known &= said);
     warnings.extend(out.warnings);
     if t.next_observations.is_empty() {
         t.next_observations = t.observations[t.obs_dim..].to_vec();
@@ -198,6 +200,7 @@ fn reorder(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, order:
     t.rewards = rows::reordered(&t.rewards, 1, order);
     t.next_observations = rows::reordered(&t.next_observations, t.obs_dim, order);
     t.terminals = rows::reordered(&t.terminals, 1, order);
+    t.known = rows::reordered(&t.known, 1, order);
     if !t.timeouts.is_empty() {
         t.timeouts = rows::reordered(&t.timeouts, 1, order);
     }

@@ -53,6 +53,8 @@ pub(super) struct Column {
 enum Kind {
     /// (N, D), D >= 1. Must have been written.
     Matrix,
+    /// As a matrix; numbers need not be finite.
+    Gaps,
     /// (N, D) or (N,). Must have been written.
     Table,
     /// (N,) or (N, 1). What was never written is the fill value.
@@ -139,6 +141,11 @@ impl Hdf5 {
     /// A matrix: shape (N, D), D >= 1.
     pub fn matrix(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Matrix)
+    }
+
+    /// A matrix that may hold NaN and infinity.
+    pub fn matrix_with_gaps(&self, name: &str) -> Result<Column, DataError> {
+        self.read(name, Kind::Gaps)
     }
 
     /// A matrix, or a vector as a matrix of one column: shape (N, D) or (N,).
@@ -243,11 +250,11 @@ impl Hdf5 {
             return Err(self.invalid(Problem::WrongType, name, format!("type {datatype}"), expected, advice));
         }
         let (rows, dim) = match (kind, &shape[..]) {
-            (Kind::Matrix | Kind::Table, &[n, d]) if d > 0 => (n, d),
+            (Kind::Matrix | Kind::Gaps | Kind::Table, &[n, d]) if d > 0 => (n, d),
             (Kind::Table, &[n]) | (Kind::Vector, &[n] | &[n, 1]) => (n, 1),
             _ => {
                 let expected = match kind {
-                    Kind::Matrix => "shape (N, D)",
+                    Kind::Matrix | Kind::Gaps => "shape (N, D)",
                     Kind::Table => "shape (N, D) or (N,)",
                     Kind::Vector => "shape (N,) or (N, 1)",
                 };
@@ -259,7 +266,7 @@ impl Hdf5 {
             return Err(self.invalid(Problem::Empty, name, "0 rows", "at least one row", "Use another file"));
         }
         let unwritten = match kind {
-            Kind::Matrix | Kind::Table => Unwritten::Refuse,
+            Kind::Matrix | Kind::Gaps | Kind::Table => Unwritten::Refuse,
             Kind::Vector => Unwritten::Fill,
         };
         let filled = self.ensure_stored(name, &dataset, unwritten)?;
@@ -270,7 +277,9 @@ impl Hdf5 {
             return Err(self.invalid(Problem::Malformed, name, found, "as many as the shape says", REPAIR));
         }
         let (rows, dim) = (rows as usize, dim as usize);
-        self.ensure_finite(name, &dataset, &datatype, &data, dim)?;
+        if !matches!(kind, Kind::Gaps) {
+            self.ensure_finite(name, &dataset, &datatype, &data, dim)?;
+        }
         if let Some(inexact) = guard(&self.path, name, || numbers::inexact_integers(&dataset, &datatype, &data, dim))? {
             let (at, number) = inexact.first;
             self.note(format!(
