@@ -44,14 +44,7 @@ pub struct AtomicFile {
 impl AtomicFile {
     /// Starts `target`, in its own directory (created if missing), so that the final rename cannot cross devices.
     pub fn create(target: &Path) -> Result<Self, FileError> {
-        let directory = parent(target);
-        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
-        sweep(directory);
-        let temporary = tempfile::Builder::new()
-            .prefix(&format!("{PREFIX}{}.", Owner::this()))
-            .suffix(SUFFIX)
-            .tempfile_in(directory)
-            .map_err(|e| FileError::new(target, "create a temporary file beside it", e))?;
+        let temporary = beside(target, "create a temporary file beside it", |b, directory| b.tempfile_in(directory))?;
         Ok(Self { target: target.to_owned(), temporary })
     }
 
@@ -106,14 +99,7 @@ pub struct AtomicFolder {
 impl AtomicFolder {
     /// Starts `target`, in the folder that it will be in (created if missing).
     pub fn create(target: &Path) -> Result<Self, FileError> {
-        let directory = parent(target);
-        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
-        sweep(directory);
-        let temporary = tempfile::Builder::new()
-            .prefix(&format!("{PREFIX}{}.", Owner::this()))
-            .suffix(SUFFIX)
-            .tempdir_in(directory)
-            .map_err(|e| FileError::new(target, "create a temporary folder beside it", e))?;
+        let temporary = beside(target, "create a temporary folder beside it", |b, directory| b.tempdir_in(directory))?;
         Ok(Self { target: target.to_owned(), temporary })
     }
 
@@ -143,6 +129,21 @@ impl AtomicFolder {
         let _ = temporary.keep();
         flush_directory(&target)
     }
+}
+
+/// What `make` makes in the directory of `target` (created if missing), under a temporary name of this process.
+fn beside<T>(
+    target: &Path,
+    action: &'static str,
+    make: impl FnOnce(&tempfile::Builder<'_, '_>, &Path) -> io::Result<T>,
+) -> Result<T, FileError> {
+    let directory = parent(target);
+    fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+    sweep(directory);
+    let prefix = format!("{PREFIX}{}.", Owner::this());
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(&prefix).suffix(SUFFIX);
+    make(&builder, directory).map_err(|e| FileError::new(target, action, e))
 }
 
 /// Removes the temporary files and folders that killed processes of this machine left in `directory`. Whatever they were to become is not there,
@@ -228,9 +229,14 @@ fn parent(path: &Path) -> &Path {
 
 /// Writes `bytes` to `path`, whole or not at all.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+    filled(path, bytes)?.commit()
+}
+
+/// The file `path` in the making, with all its bytes.
+fn filled(path: &Path, bytes: &[u8]) -> Result<AtomicFile, FileError> {
     let mut file = AtomicFile::create(path)?;
     file.file().write_all(bytes).map_err(|e| FileError::new(path, "write", e))?;
-    file.commit()
+    Ok(file)
 }
 
 /// Writes `value` as indented JSON to `path`, whole or not at all.
@@ -240,9 +246,7 @@ pub fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), FileError>
 
 /// As [`write_json`], unless there is such a file: of several that write it, the first one does. Whether this one did.
 pub fn write_json_first<T: Serialize>(path: &Path, value: &T) -> Result<bool, FileError> {
-    let mut file = AtomicFile::create(path)?;
-    file.file().write_all(&json(path, value)?).map_err(|e| FileError::new(path, "write", e))?;
-    file.commit_first()
+    filled(path, &json(path, value)?)?.commit_first()
 }
 
 fn json<T: Serialize>(path: &Path, value: &T) -> Result<Vec<u8>, FileError> {

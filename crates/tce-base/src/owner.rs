@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// The process that owns a file or directory in the making: machine, process and when that started, because numbers of processes come again.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -20,8 +21,13 @@ impl std::fmt::Display for Owner {
 impl Owner {
     /// This process.
     pub fn this() -> Self {
-        let process = std::process::id();
-        Self { machine: machine(), process, started: started(process).unwrap_or(0) }
+        // Asked for by every file that is written, and always the same.
+        static THIS: OnceLock<Owner> = OnceLock::new();
+        let find = || {
+            let process = std::process::id();
+            Self { machine: machine(), process, started: started(process).unwrap_or(0) }
+        };
+        THIS.get_or_init(find).clone()
     }
 
     /// The one in the name of a file or directory: `OWNER.x`, where x is what tells the owner's works apart.
@@ -36,7 +42,7 @@ impl Owner {
 
     /// Whether it is certainly gone. Of another machine nothing is certain.
     pub fn dead(&self) -> bool {
-        let known = self.started != 0 && self.machine == machine();
+        let known = self.started != 0 && self.machine == Self::this().machine;
         known && started(self.process) != Some(self.started)
     }
 }

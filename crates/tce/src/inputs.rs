@@ -135,7 +135,6 @@ impl Table {
     }
 
     fn scale(&mut self, range: &ActionRange) {
-        self.own_actions = Some(self.complete().actions.clone());
         range.to_unit(&mut self.rows.actions);
         self.complete.iter_mut().for_each(|t| range.to_unit(&mut t.actions));
     }
@@ -187,9 +186,7 @@ impl Inputs {
         let table = |path: &Path| Table::read(path, &options);
         let (target, source, extra) = (table(target)?, source.map(table).transpose()?, extra.map(table).transpose()?);
         let (agent, limit) = (own.agent(), own.step_limit.map(|n| n as usize));
-        let mut inputs = Self { agent, shift: None, target, source, extra, actions: None, limit }.checked()?;
-        inputs.bring_into_the_box(own)?;
-        Ok(inputs)
+        Self { agent, shift: None, target, source, extra, actions: None, limit }.checked(own)
     }
 
     /// Finds the units of the files' actions, and brings all tables into the box.
@@ -203,8 +200,8 @@ impl Inputs {
                 self.target.file.display()
             )));
         }
-        let wild = ActionRange::with_outliers(&rows);
-        if !wild.is_empty() && own.action_range.is_none() {
+        let wild = if own.action_range.is_none() { ActionRange::with_outliers(&rows) } else { Vec::new() };
+        if !wild.is_empty() {
             eprintln!(
                 "warning: action columns {wild:?} have values more than ten times what 99.9 % of them are: all others become small inside. Remove \
                  them, or give --action-range"
@@ -238,6 +235,8 @@ impl Inputs {
         };
         self.actions = range.filter(|r| !r.is_unit());
         if let Some(range) = &self.actions {
+            // The target's alone are written again.
+            self.target.own_actions = Some(self.target.complete().actions.clone());
             let (target, source, extra) = (&mut self.target, &mut self.source, &mut self.extra);
             std::iter::once(target).chain(source).chain(extra).for_each(|table| table.scale(range));
         }
@@ -271,9 +270,7 @@ impl Inputs {
         let target = Table::read(&target_file(task, args)?, &options)?;
         let source = source_rows.map(|rows| Table::read(&source_file(task, args, rows)?, &options)).transpose()?;
         let (agent, shift) = (Some(agent), Some(shift));
-        let mut inputs = Self { agent, shift, target, source, extra: None, actions: None, limit: None }.checked()?;
-        inputs.bring_into_the_box(&own)?;
-        Ok(inputs)
+        Self { agent, shift, target, source, extra: None, actions: None, limit: None }.checked(&own)
     }
 
     /// [`Inputs::of_task`] as `config` wants them: without source rows if it has no use for them, with as many target rows as it says.
@@ -349,7 +346,8 @@ impl Inputs {
         InputSpec { chosen, ..self.spec(with_source) }
     }
 
-    fn checked(self) -> Result<Self> {
+    /// Refuses files that do not fit, and brings all tables into the box.
+    fn checked(mut self, own: &Own) -> Result<Self> {
         std::iter::once(&self.target).chain(&self.source).chain(&self.extra).try_for_each(Table::usable)?;
         for other in self.source.iter().chain(&self.extra) {
             ensure_same_agent(&other.rows, &self.target.rows, self.agent)?;
@@ -364,6 +362,7 @@ impl Inputs {
                 );
             }
         }
+        self.bring_into_the_box(own)?;
         Ok(self)
     }
 

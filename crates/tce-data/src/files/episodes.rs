@@ -56,36 +56,38 @@ impl Resolved {
 /// A column's tolerance is a tenth of its median step, at most a hundredth of its spread; or three times what nine tenths of the
 /// successors miss the next row by, at most a fiftieth of its spread; and at least what float32 and six digits leave. A reset that hits the next
 /// state in every column this closely is no break.
-pub(super) struct Continuity<'a> {
+struct Continuity<'a> {
     table: &'a Table<'a>,
     next: &'a [f32],
-    tolerance: Vec<f32>,
+    tolerance: &'a [f32],
 }
 
-impl<'a> Continuity<'a> {
-    fn new(table: &'a Table<'a>, next: &'a [f32]) -> Self {
-        let (d, n) = (table.dim, table.terminals.len());
-        let sample: Vec<usize> = (0..n).step_by(n.div_ceil(SAMPLE)).collect();
-        let column = |k: usize| {
-            let s = |i: usize| f64::from(table.observations[i * d + k]);
-            let count = sample.len() as f64;
-            let mean = sample.iter().map(|&i| s(i)).sum::<f64>() / count;
-            let spread = (sample.iter().map(|&i| (s(i) - mean).powi(2)).sum::<f64>() / count).sqrt();
-            let largest = sample.iter().map(|&i| s(i).abs()).fold(0.0, f64::max);
-            let mut steps: Vec<f64> = sample.iter().map(|&i| (f64::from(next[i * d + k]) - s(i)).abs()).collect();
-            let middle = steps.len() / 2;
-            let step = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
-            // What nine tenths of the successors miss the next row by is how they were rounded.
-            let miss = |&i: &usize| (f64::from(next[i * d + k]) - f64::from(table.observations[(i + 1) * d + k])).abs();
-            let mut misses: Vec<f64> = sample.iter().filter(|i| **i + 1 < n).map(miss).collect();
-            let at = misses.len() * 9 / 10;
-            let rounding = if misses.is_empty() { 0.0 } else { *misses.select_nth_unstable_by(at, f64::total_cmp).1 };
-            let by_step = (0.1 * step).clamp(1e-4 * spread, 1e-2 * spread);
-            by_step.max((3.0 * rounding).min(2e-2 * spread)).max(2e-6 * largest) as f32
-        };
-        Self { table, next, tolerance: (0..d).map(column).collect() }
-    }
+/// The tolerance of each column; empty where there are no stored successors.
+pub(super) fn tolerance(table: &Table<'_>) -> Vec<f32> {
+    let Some(next) = table.next_observations else { return Vec::new() };
+    let (d, n) = (table.dim, table.terminals.len());
+    let sample: Vec<usize> = (0..n).step_by(n.div_ceil(SAMPLE)).collect();
+    let column = |k: usize| {
+        let s = |i: usize| f64::from(table.observations[i * d + k]);
+        let count = sample.len() as f64;
+        let mean = sample.iter().map(|&i| s(i)).sum::<f64>() / count;
+        let spread = (sample.iter().map(|&i| (s(i) - mean).powi(2)).sum::<f64>() / count).sqrt();
+        let largest = sample.iter().map(|&i| s(i).abs()).fold(0.0, f64::max);
+        let mut steps: Vec<f64> = sample.iter().map(|&i| (f64::from(next[i * d + k]) - s(i)).abs()).collect();
+        let middle = steps.len() / 2;
+        let step = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
+        // What nine tenths of the successors miss the next row by is how they were rounded.
+        let miss = |&i: &usize| (f64::from(next[i * d + k]) - f64::from(table.observations[(i + 1) * d + k])).abs();
+        let mut misses: Vec<f64> = sample.iter().filter(|i| **i + 1 < n).map(miss).collect();
+        let at = misses.len() * 9 / 10;
+        let rounding = if misses.is_empty() { 0.0 } else { *misses.select_nth_unstable_by(at, f64::total_cmp).1 };
+        let by_step = (0.1 * step).clamp(1e-4 * spread, 1e-2 * spread);
+        by_step.max((3.0 * rounding).min(2e-2 * spread)).max(2e-6 * largest) as f32
+    };
+    (0..d).map(column).collect()
+}
 
+impl Continuity<'_> {
     /// Whether there is a row i + lag and the stored successor of row i is its state.
     fn joined(&self, i: usize, lag: usize) -> bool {
         let d = self.table.dim;
@@ -94,7 +96,7 @@ impl<'a> Continuity<'a> {
         }
         let (next, state) =
             (&self.next[i * d..(i + 1) * d], &self.table.observations[(i + lag) * d..(i + lag + 1) * d]);
-        same_bits(next, state) || next.iter().zip(state).zip(&self.tolerance).all(|((a, b), t)| (a - b).abs() <= *t)
+        same_bits(next, state) || next.iter().zip(state).zip(self.tolerance).all(|((a, b), t)| (a - b).abs() <= *t)
     }
 
     /// For every row whether the next one continues it.
@@ -111,10 +113,10 @@ fn same_bits(a: &[f32], b: &[f32]) -> bool {
 
 /// How many environments take turns in the rows: s'ᵢ is the state of row i + k and not of row i + 1. One, where nothing says
 /// otherwise.
-pub(super) fn environments(table: &Table<'_>) -> usize {
+pub(super) fn environments(table: &Table<'_>, tolerance: &[f32]) -> usize {
     let n = table.terminals.len();
     let Some(next) = table.next_observations else { return 1 };
-    let continuity = Continuity::new(table, next);
+    let continuity = Continuity { table, next, tolerance };
     let sample: Vec<usize> = (0..n).step_by(n.div_ceil(2000)).collect();
     let share = |lag: usize| {
         let rows: Vec<_> = sample.iter().filter(|&&i| i + lag < n).collect();
@@ -135,16 +137,17 @@ pub(super) fn untangled(n: usize, environments: usize) -> Vec<usize> {
 /// Whether a row that ends no episode has another successor than the next row.
 pub(super) fn has_unmarked_ends(table: &Table<'_>) -> bool {
     let (Some(next), Some(timeouts)) = (table.next_observations, table.timeouts) else { return true };
-    let continuity = Continuity::new(table, next);
+    let tolerance = tolerance(table);
+    let continuity = Continuity { table, next, tolerance: &tolerance };
     let last = table.terminals.len() - 1;
     (0..last).into_par_iter().any(|i| !table.terminals[i] && !timeouts[i] && !continuity.joined(i, 1))
 }
 
 /// Decides, for rows that are in their order.
-pub(super) fn resolve(table: &Table<'_>, environments: usize) -> Resolved {
+pub(super) fn resolve(table: &Table<'_>, tolerance: &[f32], environments: usize) -> Resolved {
     match (table.next_observations, table.timeouts) {
         (Some(next), timeouts) => {
-            let mut joined = Continuity::new(table, next).all();
+            let mut joined = Continuity { table, next, tolerance }.all();
             cut_between(&mut joined, environments);
             match timeouts {
                 Some(timeouts) => by_marks(table, timeouts, &joined),

@@ -158,15 +158,18 @@ fn settle(
     warnings: &mut Vec<String>,
 ) -> Summary {
     let rows = t.len();
-    let environments = episodes::environments(&table(t, limit));
+    let mut tolerance = episodes::tolerance(&table(t, limit));
+    let environments = episodes::environments(&table(t, limit), &tolerance);
     if environments > 1 {
         warnings.push(format!(
             "the rows of {environments} environments take turns (s' is the state {environments} rows later): they were put one environment \
              after the other"
         ));
         reorder(t, columns, &episodes::untangled(rows, environments));
+        // How far rows in order are apart is another thing.
+        tolerance = episodes::tolerance(&table(t, limit));
     }
-    let mut out = episodes::resolve(&table(t, limit), environments);
+    let mut out = episodes::resolve(&table(t, limit), &tolerance, environments);
     // What the file itself does not know stays so.
     out.known.iter_mut().zip(&t.known).for_each(|(known, said)| *known &= said);
     warnings.extend(out.warnings);

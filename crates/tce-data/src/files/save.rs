@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
-use hdf5_pure::{AttrValue, DatasetBuilder, EnumTypeBuilder, FileBuilder, make_i8_type};
+use hdf5_pure::{AttrValue, DatasetBuilder, Datatype, EnumTypeBuilder, FileBuilder, make_i8_type};
 use tce_base::{AtomicFile, FileError};
 
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
@@ -33,11 +33,7 @@ pub fn save_d4rl(
 ) -> Result<(), DataError> {
     validate(path, data, columns)?;
     let mut builder = FileBuilder::new();
-    let boolean = EnumTypeBuilder::with_base(make_i8_type())
-        .u8_value("FALSE", 0)
-        .u8_value("TRUE", 1)
-        .build()
-        .expect("a constant type");
+    let boolean = boolean();
     for (name, values, dim) in [
         ("observations", &data.observations, data.obs_dim),
         ("actions", &data.actions, data.act_dim),
@@ -81,6 +77,12 @@ pub fn save_d4rl(
     finish(builder, file.file(), path)?;
     file.commit()?;
     Ok(())
+}
+
+/// The type of h5py's booleans.
+pub(super) fn boolean() -> Datatype {
+    let values = EnumTypeBuilder::with_base(make_i8_type()).u8_value("FALSE", 0).u8_value("TRUE", 1);
+    values.build().expect("a constant type")
 }
 
 /// Writes what was built into `file`; `path` is for messages.

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use hdf5_pure::{AttrValue, EnumTypeBuilder, FileBuilder, make_i8_type};
+use hdf5_pure::{AttrValue, FileBuilder};
 use tce_base::{AtomicFile, AtomicFolder, write_json};
 
-use super::save::finish;
+use super::save::{boolean, finish};
 use crate::{ActionRange, DataError, Problem, Transitions};
 
 /// Read by Minari 0.5.
@@ -34,11 +34,7 @@ pub fn save_minari(path: &Path, id: &str, data: &Transitions, range: Option<&Act
     let folder = whole.path().join("data");
 
     let mut builder = FileBuilder::new();
-    let boolean = EnumTypeBuilder::with_base(make_i8_type())
-        .u8_value("FALSE", 0)
-        .u8_value("TRUE", 1)
-        .build()
-        .expect("a constant type");
+    let boolean = boolean();
     let (d, a) = (data.obs_dim, data.act_dim);
     let episodes = data.episodes();
     for (k, e) in episodes.iter().enumerate() {
