@@ -30,7 +30,7 @@ use tce_nn::{
 use crate::buffer::Buffer;
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, normal_log_prob, squared_error};
-use crate::mlp_policy::{Head, LOG_STD_RANGE, PolicySpec, from_population};
+use crate::mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec, from_population};
 use crate::policy::Policy;
 use crate::training::member_noise;
 
@@ -214,6 +214,30 @@ impl Actor {
         let mlp: MlpConfig = specs[0].network();
         let net = ActorNet { mlp: mlp.init(&buffer.streams(), name, &device), log_std };
         Ok(Self { net: Trained::new(net), config: config.clone(), specs, steps })
+    }
+
+    /// The weights of `policy`, which came from `path`, in place of drawn ones; the optimiser stays new.
+    ///
+    /// # Errors
+    /// If it is not a network of the same inputs, layers and form, or this is a population of several.
+    pub fn begin_with(&mut self, policy: &MlpPolicy, path: &Path) -> Result<(), LearnError> {
+        if self.specs.len() != 1 || *policy.spec() != self.specs[0] {
+            let (path, field) = (path.to_owned(), "policy".to_owned());
+            let say = |s: &PolicySpec| {
+                let plain =
+                    s.standardizer.mean.iter().all(|m| *m == 0.0) && s.standardizer.std.iter().all(|s| *s == 1.0);
+                let units = if plain { "as they are" } else { "standardised" };
+                let layers = format!("hidden layers {:?}, {:?}", s.hidden, s.head);
+                format!("{} observations {units}, {} actions, {layers}", s.observations, s.actions)
+            };
+            let (found, expected) = (say(policy.spec()), say(&self.specs[0]));
+            let remedy = "give a policy that `tce train-sac` wrote, of the same robot".to_owned();
+            return Err(LearnError::Policy { path, field, found, expected, remedy });
+        }
+        let net = self.net.net().clone();
+        let mlp = policy.to_parameters().apply("policy", net.mlp, path)?;
+        self.net = Trained::new(ActorNet { mlp, ..net });
+        Ok(())
     }
 
     /// π(·|s).

@@ -19,6 +19,7 @@
 //! | - | `hidden` | 256, 256 ReLU | the same; D4RL |
 //! | H̄ | `target_entropy` | -d_a | the same |
 //! | α at the start | `initial_alpha` | 1 | their code |
+//! | - | `policy_start` | 0 | ours: updates of the critics alone, where the policy is not a new one |
 
 use std::path::Path;
 
@@ -32,6 +33,7 @@ use crate::buffer::{Buffer, Minibatch};
 use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
+use crate::mlp_policy::MlpPolicy;
 use crate::policy::Policy;
 use crate::training::{Learner, Meter, PolicyLearner};
 
@@ -51,12 +53,15 @@ pub struct SacConfig {
     pub target_entropy: Option<f64>,
     /// α before the first step.
     pub initial_alpha: f64,
+    /// Updates of the critics before the first of policy and α. New critics know nothing of a trained policy, and would spoil it.
+    pub policy_start: u64,
 }
 
 impl Default for SacConfig {
     fn default() -> Self {
         let hidden = vec![256, 256];
-        Self { discount: 0.99, polyak: 0.005, lr: 3e-4, hidden, target_entropy: None, initial_alpha: 1.0 }
+        let (target_entropy, policy_start) = (None, 0);
+        Self { discount: 0.99, polyak: 0.005, lr: 3e-4, hidden, target_entropy, initial_alpha: 1.0, policy_start }
     }
 }
 
@@ -111,6 +116,14 @@ impl Sac {
         host(self.actor.frozen(s).sample_with_log_prob(&self.members, "exploration", step).0)
     }
 
+    /// Begins with the weights of a trained policy, from `path`.
+    ///
+    /// # Errors
+    /// As [`Actor::begin_with`].
+    pub fn begin_with(&mut self, policy: &MlpPolicy, path: &Path) -> Result<(), LearnError> {
+        self.actor.begin_with(policy, path)
+    }
+
     /// Where it computes; batches are made there.
     pub fn device(&self) -> Device {
         self.device.clone()
@@ -145,6 +158,9 @@ impl Learner for Sac {
         let loss = critics.step(state_action(&batch.s, batch.a.clone()), y, None, c.lr, c.polyak);
         meter.record("critic_loss", &loss);
 
+        if step < c.policy_start {
+            return;
+        }
         // L_π: gradients reach the action through the critics, whose weights stay.
         let (a, log_prob) = drawn;
         let sa = state_action(&batch.s, a);

@@ -22,16 +22,16 @@ use tce_base::random::fill_uniform;
 use tce_base::{FileError, Progress, Streams, interrupted, read_if_there, sha256_file, write_atomically, write_json};
 use tce_data::{Agent, LoadOptions, ScoreTable, Shift, load, save_d4rl};
 use tce_learn::sac::{Sac, SacConfig};
-use tce_learn::{Buffer, Learner, Meter, Policy, PolicyLearner};
+use tce_learn::{Buffer, Learner, Meter, Policy, PolicyKind, PolicyLearner};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::{EPISODE_LIMIT, Env};
 
 use crate::PROGRAM;
-use crate::actors::{Arena, Evaluation, evaluate};
+use crate::actors::{Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::metrics::Metrics;
 use crate::output::mean_std;
-use crate::zoo::Card;
+use crate::zoo::{Card, Exhibit};
 
 /// What decides a training. Its end may be moved when it goes on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -48,7 +48,7 @@ pub struct Settings {
     pub steps_per_update: u64,
     /// Rows per update.
     pub batch: usize,
-    /// The training whose networks this one began with.
+    /// What it began with, if not with new networks.
     pub from: Option<Origin>,
     /// Steps between evaluations.
     pub evaluate_every: u64,
@@ -171,39 +171,88 @@ fn lock(directory: &Path) -> Result<std::fs::File> {
     }
 }
 
-/// The training whose networks another one began with.
+/// What a training began with, if not with networks of its own.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Origin {
-    /// Where it was.
-    pub directory: PathBuf,
-    /// `hopper-source seed 0, step 300000`.
-    pub training: String,
-    /// The file of its networks there.
-    pub file: String,
-    /// SHA-256 of that file.
-    pub sha256: String,
+#[serde(untagged)]
+pub enum Origin {
+    /// All networks of another training.
+    Training {
+        /// Where it was.
+        directory: PathBuf,
+        /// `hopper-source seed 0, step 300000`.
+        training: String,
+        /// The file of its networks there.
+        file: String,
+        /// SHA-256 of that file.
+        sha256: String,
+    },
+    /// A policy; critics and temperature are new.
+    Actor {
+        /// Its file, or `zoo:NAME`.
+        actor: PathBuf,
+        /// SHA-256 of that file.
+        sha256: String,
+    },
 }
 
 impl Origin {
-    fn of(directory: &Path, agent: Agent) -> Result<Self> {
+    /// Of a training's directory, a policy's file or `zoo:NAME`.
+    fn of(path: &Path, agent: Agent) -> Result<Self> {
+        if let Some(exhibit) = Exhibit::at(path)? {
+            return Ok(Self::Actor { actor: path.to_owned(), sha256: exhibit.sha256() });
+        }
+        if path.is_file() {
+            return Ok(Self::Actor { actor: path.to_owned(), sha256: sha256_file(path)? });
+        }
         let none = || {
-            let message =
-                "no checkpoint of a training here; give the directory of one, such as runs/sac/hopper-source-seed0";
-            Error::Usage(format!("{}: {message}", directory.display()))
+            let message = "no checkpoint of a training here; give the directory of one, such as \
+                runs/sac/hopper-source-seed0, or a policy: its file, or zoo:NAME";
+            Error::Usage(format!("{}: {message}", path.display()))
         };
-        let settings: Settings = read_json(&directory.join("settings.json"))?.ok_or_else(none)?;
+        let settings: Settings = read_json(&path.join("settings.json"))?.ok_or_else(none)?;
         if settings.agent != agent {
             let message = "a policy of one robot cannot drive another";
-            return Err(Error::Usage(format!("{}: a training of {}; {message}", directory.display(), settings.agent)));
+            return Err(Error::Usage(format!("{}: a training of {}; {message}", path.display(), settings.agent)));
         }
-        let ledger = Ledger::read(directory)?.ok_or_else(none)?;
+        let ledger = Ledger::read(path)?.ok_or_else(none)?;
         let (file, sha256) = ledger.files.into_iter().find(|f| f.0.ends_with(".safetensors")).ok_or_else(none)?;
         let training = format!("{agent}-{} seed {}, step {}", settings.shift, settings.seed, ledger.step);
-        Ok(Self { directory: directory.to_owned(), training, file, sha256 })
+        Ok(Self::Training { directory: path.to_owned(), training, file, sha256 })
     }
 
-    fn learner(&self) -> PathBuf {
-        self.directory.join(&self.file)
+    /// What the user named.
+    fn path(&self) -> &Path {
+        match self {
+            Self::Training { directory: path, .. } | Self::Actor { actor: path, .. } => path,
+        }
+    }
+
+    /// For a card.
+    fn describe(&self) -> String {
+        match self {
+            Self::Training { training, .. } => training.clone(),
+            Self::Actor { actor, .. } => actor.display().to_string(),
+        }
+    }
+
+    /// Puts it into the networks of a training that begins.
+    fn start(&self, sac: &mut Sac, agent: Agent) -> Result<()> {
+        match self {
+            Self::Training { directory, file, sha256, .. } => {
+                let path = directory.join(file);
+                verify(&path, sha256)?;
+                sac.restore(&NamedParameters::load(&path)?, &path)?;
+            }
+            Self::Actor { actor, .. } => {
+                let policy = load_policy(actor, agent)?;
+                let PolicyKind::Mlp(network) = policy.kind() else {
+                    let message = "a policy with a memory; SAC goes on from networks of one state only";
+                    return Err(Error::Usage(format!("{}: {message}", actor.display())));
+                };
+                sac.begin_with(network, actor)?;
+            }
+        }
+        Ok(())
     }
 }
 
@@ -236,7 +285,7 @@ pub struct Training {
 }
 
 impl Training {
-    /// Starts in `directory`, with the networks of the training in `from` if there is one, or goes on from the checkpoint
+    /// Starts in `directory`, with the networks of the training or policy `from` if there is one, or goes on from the checkpoint
     /// there.
     ///
     /// # Errors
@@ -261,12 +310,12 @@ impl Training {
                 Error::Failed(format!("{}: missing, beside a checkpoint; restore the directory", path.display()))
             })?;
             if let (Some(from), Some(found)) = (from, &found.from)
-                && from != found.directory
+                && from != found.path()
             {
                 return Err(Error::Usage(format!(
                     "{}: the training there began with {}, not {}",
                     path.display(),
-                    found.directory.display(),
+                    found.path().display(),
                     from.display()
                 )));
             }
@@ -281,16 +330,15 @@ impl Training {
             settings.from = from.map(|from| Origin::of(from, settings.agent)).transpose()?;
             write_json(&path, &settings)?;
         }
-        let origin = settings.from.as_ref().filter(|_| ledger.is_none()).map(|o| (o.learner(), o.sha256.clone()));
+        let origin = settings.from.clone().filter(|_| ledger.is_none());
         let ledger = ledger.unwrap_or_default();
         let (agent, streams) = (settings.agent, Streams::new(settings.seed));
         // Ant's contact slots, which are always 0.
         let dead = if agent == Agent::Ant { (27..111).collect() } else { Vec::new() };
         let mut buffer = Buffer::replay(streams, agent.dims(), dead, settings.batch);
         let mut sac = Sac::new(&buffer, &settings.sac, device)?;
-        if let Some((learner, hash)) = origin {
-            verify(&learner, &hash)?;
-            sac.restore(&NamedParameters::load(&learner)?, &learner)?;
+        if let Some(origin) = origin {
+            origin.start(&mut sac, agent)?;
         }
         for (file, _) in &ledger.files {
             let path = directory.join(file);
@@ -497,7 +545,7 @@ fn save_card(policy: &Policy, path: &Path, settings: &Settings, judged: &Judged)
         steps: judged.step,
         updates: judged.step.saturating_sub(settings.start) / settings.steps_per_update,
         batch: settings.batch,
-        from: settings.from.as_ref().map(|o| o.training.clone()),
+        from: settings.from.as_ref().map(Origin::describe),
         episodes: settings.episodes,
         mean: judged.mean,
         std: judged.std,

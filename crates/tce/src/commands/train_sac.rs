@@ -40,9 +40,16 @@ pub struct TrainSac {
     /// Directory of the trainings, one below it for each.
     #[arg(long, default_value = "runs/sac")]
     out: PathBuf,
-    /// Begin with the networks of the training in this directory, in another domain of the same robot.
+    /// Begin with networks of the same robot in another domain: the directory of a training, or a policy (its file, or
+    /// zoo:NAME).
     #[arg(long)]
     from: Option<PathBuf>,
+    /// Updates of the critics alone, before the policy's first.
+    #[arg(long, default_value_t = 0)]
+    policy_start: u64,
+    /// The temperature α before the first update. A trained policy wants less than a new one.
+    #[arg(long, default_value_t = 1.0)]
+    temperature: f64,
     /// Steps before the first update: uniformly random, or the policy's of --from.
     #[arg(long, default_value_t = 10_000)]
     start: u64,
@@ -109,7 +116,11 @@ impl TrainSac {
                     from: None,
                     evaluate_every: self.evaluate_every,
                     episodes: self.episodes,
-                    sac: SacConfig::default(),
+                    sac: SacConfig {
+                        policy_start: self.policy_start,
+                        initial_alpha: self.temperature,
+                        ..SacConfig::default()
+                    },
                 };
                 let directory = self.out.join(format!("{agent}-{shift}-seed{seed}"));
                 let training = Training::open(&directory, settings, self.from.as_deref(), goal.clone(), device)?;
