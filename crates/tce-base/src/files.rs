@@ -17,7 +17,7 @@ const SUFFIX: &str = ".part";
 
 /// A file could not be read or written.
 #[derive(Debug, thiserror::Error)]
-#[error("{}: cannot {action}: {source}", path.display())]
+#[error("{}: cannot {action}: {}", path.display(), in_words(source))]
 pub struct FileError {
     /// The file in question (its final name, not the temporary one).
     pub path: PathBuf,
@@ -27,10 +27,51 @@ pub struct FileError {
     pub source: io::Error,
 }
 
+/// What the system says, without its numbers.
+fn in_words(error: &io::Error) -> String {
+    let known = match error.kind() {
+        io::ErrorKind::NotFound => "there is no such file or folder",
+        io::ErrorKind::PermissionDenied => "you have no right to; change the permissions, or choose another place",
+        io::ErrorKind::IsADirectory => "it is a folder, not a file",
+        io::ErrorKind::NotADirectory => "a part of the path is a file, not a folder",
+        io::ErrorKind::StorageFull => "no space is left on the device; make room, or choose another place",
+        io::ErrorKind::ReadOnlyFilesystem => "the file system is read-only; choose another place",
+        // What is no error of the system has words of its own.
+        _ => return error.to_string(),
+    };
+    // Words of this program (`io::Error::other` and the like) say more than the kind.
+    if error.get_ref().is_some() { error.to_string() } else { known.to_owned() }
+}
+
 impl FileError {
     /// An error while doing `action` to `path`.
     pub fn new(path: &Path, action: &'static str, source: io::Error) -> Self {
         Self { path: path.to_owned(), action, source }
+    }
+}
+
+/// Whether something called `path` could be written: told by a temporary file in the nearest folder above it that exists. Asked
+/// before long work, whose result would have no place in the end.
+///
+/// # Errors
+/// What the system says, under the name `path`.
+pub fn ensure_writable(path: &Path) -> Result<(), FileError> {
+    let whole = std::path::absolute(path).map_err(|e| FileError::new(path, "write", e))?;
+    let above = whole.ancestors().skip(1).find(|p| p.exists()).unwrap_or(Path::new("/"));
+    if !above.is_dir() {
+        return Err(FileError::new(path, "write", io::ErrorKind::NotADirectory.into()));
+    }
+    tempfile::tempfile_in(above).map(drop).map_err(|e| FileError::new(path, "write", e))
+}
+
+/// [`ensure_writable`] for a folder that is filled: where it exists, it is its own place.
+///
+/// # Errors
+/// As [`ensure_writable`]; if there is a file of that name.
+pub fn ensure_folder(path: &Path) -> Result<(), FileError> {
+    match path.exists() {
+        true => ensure_writable(&path.join("x")).map_err(|e| FileError::new(path, "write into", e.source)),
+        false => ensure_writable(path),
     }
 }
 

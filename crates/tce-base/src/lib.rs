@@ -6,12 +6,14 @@ pub mod owner;
 pub mod progress;
 pub mod random;
 pub mod sealed;
+pub mod words;
 
 pub use files::{
-    AtomicFile, AtomicFolder, FileError, first_damaged, link_first, move_into_place, read_if_there, sha256_file,
-    sha256_hex, write_atomically, write_json, write_json_first,
+    AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
+    read_if_there, sha256_file, sha256_hex, write_atomically, write_json, write_json_first,
 };
 pub use owner::Owner;
 pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
 pub use random::{Rng, Streams};
 pub use sealed::{Sealed, read_sealed, write_sealed};
+pub use words::{did_you_mean, file_inside, nearest};

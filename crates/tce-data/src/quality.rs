@@ -4,6 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use tce_base::did_you_mean;
 
 /// The quality of a benchmark data set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -50,7 +51,12 @@ impl FromStr for Quality {
             "medium-replay" | "m-r" => Ok(Quality::MediumReplay),
             "medium-expert" | "m-e" => Ok(Quality::MediumExpert),
             "expert" | "e" => Ok(Quality::Expert),
-            _ => Err(format!("`{text}` is no data quality; expected medium, medium-replay, medium-expert or expert")),
+            _ => {
+                let hint = did_you_mean(text, Quality::ALL.map(Quality::name));
+                Err(format!(
+                    "`{text}` is no data quality; expected medium, medium-replay, medium-expert or expert{hint}"
+                ))
+            }
         }
     }
 }

@@ -4,6 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use tce_base::did_you_mean;
 
 use crate::Agent;
 
@@ -63,10 +64,10 @@ impl FromStr for Shift {
 
     /// Reads [`Shift::name`] and [`Shift::file_name`].
     fn from_str(text: &str) -> Result<Self, String> {
-        Shift::ALL
-            .into_iter()
-            .find(|s| s.name() == text || s.file_name() == text)
-            .ok_or_else(|| format!("`{text}` is no shift; expected source, morph, kinematic, gravity or gravity-5"))
+        Shift::ALL.into_iter().find(|s| s.name() == text || s.file_name() == text).ok_or_else(|| {
+            let hint = did_you_mean(text, Shift::ALL.map(Shift::name));
+            format!("`{text}` is no shift; expected source, morph, kinematic, gravity or gravity-5{hint}")
+        })
     }
 }
 

@@ -8,10 +8,10 @@
 //! Whoever rolls a policy out keeps one [`Memory`] per lane: made at an episode's start by [`Policy::start`], given to
 //! [`Policy::act_with`] beside the observation, told the reward by [`Policy::reward`] after the step.
 
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::Path;
 
-use tce_base::Rng;
+use tce_base::{FileError, Rng, file_inside};
 use tce_data::ActionRange;
 use tce_nn::NamedParameters;
 
@@ -61,6 +61,11 @@ impl Policy {
     /// # Errors
     /// If the file is missing, damaged, or not a policy.
     pub fn load(path: &Path) -> Result<Self, LearnError> {
+        if path.is_dir() {
+            let inside = file_inside(path, |p| p.extension().is_some_and(|e| e == "safetensors" || e == "npz"));
+            let words = format!("it is a folder, not a file{inside}");
+            return Err(FileError::new(path, "read", io::Error::new(io::ErrorKind::IsADirectory, words)).into());
+        }
         if path.extension().is_some_and(|e| e == "npz") {
             return crate::import::load_npz(path);
         }

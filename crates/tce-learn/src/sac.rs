@@ -19,6 +19,8 @@
 //! | - | `hidden` | 256, 256 ReLU | the same; D4RL |
 //! | H̄ | `target_entropy` | -d_a | the same |
 //! | α at the start | `initial_alpha` | 1 | their code |
+//! | - | `policy_lr` | none: `lr` | ours, for a policy that is not a new one |
+//! | - | `layer_norm` | no | RLPD (Ball et al. 2023), for a policy that is not a new one |
 //! | - | `policy_start` | 0 | ours: updates of the critics alone, where the policy is not a new one |
 
 use std::path::Path;
@@ -26,7 +28,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::burn::module::Param;
-use tce_nn::{Device, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
+use tce_nn::{Device, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
@@ -47,8 +49,14 @@ pub struct SacConfig {
     pub polyak: f64,
     /// Learning rate.
     pub lr: f64,
+    /// The policy's own, where it is another: a policy that is good already should not leave what its critics know.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub policy_lr: Option<f64>,
     /// Hidden layers of policy and critics.
     pub hidden: Vec<usize>,
+    /// Layer normalisation in the critics: between actions that were tried they then say nothing extreme (Ball et al. 2023).
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub layer_norm: bool,
     /// H̄; none means -d_a.
     pub target_entropy: Option<f64>,
     /// α before the first step.
@@ -60,10 +68,15 @@ pub struct SacConfig {
 impl Default for SacConfig {
     fn default() -> Self {
         let hidden = vec![256, 256];
-        let (target_entropy, policy_start) = (None, 0);
-        Self { discount: 0.99, polyak: 0.005, lr: 3e-4, hidden, target_entropy, initial_alpha: 1.0, policy_start }
+        let (target_entropy, policy_lr, policy_start) = (None, None, 0);
+        let (discount, polyak, lr, initial_alpha) = (0.99, 0.005, 3e-4, 1.0);
+        Self { discount, polyak, lr, policy_lr, hidden, layer_norm: false, target_entropy, initial_alpha, policy_start }
     }
 }
+
+/// How many times faster the target critics follow while the policy stands still: values have to come up from 0 by 1 / (1 - γ) steps,
+/// each of which takes 1 / ρ updates.
+const EAGER: f64 = 4.0;
 
 /// ln α of every member, `[P, 1, 1]`.
 #[derive(Module, Debug)]
@@ -92,15 +105,22 @@ impl Sac {
         within("polyak", config.polyak, 0.0..=1.0)?;
         within("initial_alpha", config.initial_alpha, f64::MIN_POSITIVE..=1e6)?;
         let form = PolicyForm::TanhGaussian;
-        let actor =
-            ActorConfig { form, hidden: config.hidden.clone(), lr: config.lr, cosine: false, ..Default::default() };
+        let actor = ActorConfig {
+            form,
+            hidden: config.hidden.clone(),
+            lr: config.policy_lr.unwrap_or(config.lr),
+            cosine: false,
+            ..Default::default()
+        };
         let members = buffer.streams();
         let trainable = device.clone().autodiff();
+        let critic = MlpConfig::relu(buffer.inputs().len() + buffer.act_dim(), &config.hidden, 1);
+        let critic = if config.layer_norm { critic.with_layer_norm() } else { critic };
         let log_alpha = Tensor::full([members.len(), 1, 1], config.initial_alpha.ln(), &trainable);
         Ok(Self {
             target_entropy: config.target_entropy.unwrap_or(-(buffer.act_dim() as f64)),
             actor: Actor::new(buffer, &actor, 0, device)?,
-            critics: Twins::new(buffer.inputs().len(), buffer.act_dim(), &config.hidden, &members, &trainable),
+            critics: Twins::with(&critic, &members, &trainable),
             temperature: Trained::new(Temperature { log_alpha: Param::from_tensor(log_alpha) }),
             members,
             device: device.clone(),
@@ -141,28 +161,23 @@ impl Learner for Sac {
         let alpha = temperature.net().log_alpha.val().inner().exp();
 
         // L_Q; the policy at s is computed meanwhile, for it needs nothing of it.
-        let (y, (output, drawn)) = rayon::join(
+        // Not drawn where nothing follows: a graph that nobody goes back through stays with autodiff, and slows it down.
+        let policy_learns = step >= c.policy_start;
+        let (y, drawn) = rayon::join(
             || {
                 let (a2, log_prob) = actor.frozen(batch.s2.clone()).sample_with_log_prob(members, "next action", step);
                 let (s2a2, [one, two]) = (state_action(&batch.s2, a2), &critics.pair);
                 let q = one.target(s2a2.clone()).min_pair(two.target(s2a2));
                 batch.r.clone() + batch.not_done.clone() * (q - alpha.clone() * log_prob) * c.discount
             },
-            || {
-                let output = actor.forward(batch.s.clone());
-                let drawn = output.sample_with_log_prob(members, "action", step);
-                (output, drawn)
-            },
+            || policy_learns.then(|| actor.forward(batch.s.clone()).sample_with_log_prob(members, "action", step)),
         );
-        drop(output);
-        let loss = critics.step(state_action(&batch.s, batch.a.clone()), y, None, c.lr, c.polyak);
+        let polyak = if policy_learns { c.polyak } else { (EAGER * c.polyak).min(1.0) };
+        let loss = critics.step(state_action(&batch.s, batch.a.clone()), y, None, c.lr, polyak);
         meter.record("critic_loss", &loss);
 
-        if step < c.policy_start {
-            return;
-        }
         // L_π: gradients reach the action through the critics, whose weights stay.
-        let (a, log_prob) = drawn;
+        let Some((a, log_prob)) = drawn else { return };
         let sa = state_action(&batch.s, a);
         let [one, two] = &critics.pair;
         let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));

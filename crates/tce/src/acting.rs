@@ -46,6 +46,10 @@ pub struct Settings {
     pub start: u64,
     /// Environment steps per update.
     pub steps_per_update: u64,
+    /// Share of uniformly random actions until the policy's first update, where it is not a new one: critics learn from them what other
+    /// actions than its own do.
+    #[serde(default, skip_serializing_if = "no_exploration")]
+    pub explore: f64,
     /// Rows per update.
     pub batch: usize,
     /// What it began with, if not with new networks.
@@ -56,6 +60,10 @@ pub struct Settings {
     pub episodes: usize,
     /// The learner.
     pub sac: SacConfig,
+}
+
+fn no_exploration(share: &f64) -> bool {
+    *share == 0.0
 }
 
 /// When a training ends, and what it leaves on the way.
@@ -414,7 +422,7 @@ impl Training {
     fn step(&mut self) -> Result<()> {
         let step = self.ledger.step;
         let (streams, (obs_dim, act_dim)) = (Streams::new(self.settings.seed), self.settings.agent.dims());
-        let action = if step < self.settings.start && self.settings.from.is_none() {
+        let action = if self.explores(step) {
             let mut action = vec![0.0; act_dim];
             fill_uniform(&mut streams.indexed("random action", step), &mut action);
             action.iter_mut().for_each(|a| *a = 2.0 * *a - 1.0);
@@ -462,6 +470,20 @@ impl Training {
             self.reset();
         }
         Ok(())
+    }
+
+    /// Whether the action of `step` is a uniformly random one.
+    fn explores(&self, step: u64) -> bool {
+        let Settings { start, steps_per_update, explore, sac, from, .. } = &self.settings;
+        if from.is_none() {
+            return step < *start;
+        }
+        if *explore <= 0.0 || step >= start + sac.policy_start * steps_per_update {
+            return false;
+        }
+        let mut draw = [0.0];
+        fill_uniform(&mut Streams::new(self.settings.seed).indexed("explore", step), &mut draw);
+        f64::from(draw[0]) < *explore
     }
 
     /// An evaluation with sampled actions, as D4RL's returns are, and the snapshots it is good for.

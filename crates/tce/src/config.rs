@@ -505,6 +505,7 @@ impl Config {
             ("dynamics.batch", self.dynamics.batch),
             ("labels.training.batch", self.labels.training.batch),
             ("learner.batch", self.learner.batch),
+            ("learner.steps", usize::try_from(self.learner.steps).unwrap_or(usize::MAX)),
             ("evaluation.episodes", self.evaluation.episodes),
         ] {
             within(key, value as f64, 1.0, 1e12)?;

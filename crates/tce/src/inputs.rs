@@ -1,6 +1,7 @@
 //! The two data sets of a run: found, loaded, and refused together if they do not fit.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -96,6 +97,42 @@ impl Table {
         Ok(Self::new(transitions, path, sha256_file(&main_file(path))?))
     }
 
+    /// The rows of a file that are not the target's. `tce augment` writes those beside the generated ones, and a learner that takes half of
+    /// every batch from the target would see them twice.
+    fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
+        let options = LoadOptions { all_columns: true, ..options.clone() };
+        let Loaded { transitions, report, columns } = load(path, &options)?;
+        eprintln!("{report}");
+        let hash = sha256_file(&main_file(path))?;
+        let bits = |t: &Transitions, i: usize| -> Vec<u32> {
+            let parts = [t.observation(i), t.action(i), t.next_observation(i)];
+            parts.into_iter().flatten().map(|x| x.to_bits()).collect()
+        };
+        let own = target.complete();
+        let known: HashSet<Vec<u32>> = (0..own.len()).map(|i| bits(own, i)).collect();
+        let origin = columns.get("origin");
+        let is_target =
+            |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&transitions, i).as_slice());
+        let others: Vec<usize> = (0..transitions.len()).filter(|&i| !is_target(i)).collect();
+        if others.len() == transitions.len() {
+            return Ok(Self::new(transitions, path, hash));
+        }
+        if others.is_empty() {
+            return Err(Error::Usage(format!(
+                "{}: found the rows of {} alone, expected others; leave out --extra, or give a file with generated or source rows",
+                path.display(),
+                target.file.display()
+            )));
+        }
+        let left_out = transitions.len() - others.len();
+        eprintln!(
+            "{}: {left_out} of its {} rows are target rows and are left out, for --target brings them",
+            path.display(),
+            transitions.len()
+        );
+        Ok(Self::new(transitions.select(&others), path, format!("{hash}, without {left_out} target rows")))
+    }
+
     fn new(rows: Transitions, file: &Path, hash: String) -> Self {
         let (rows, complete) = match rows.with_successors() {
             Cow::Borrowed(_) => (rows, None),
@@ -184,7 +221,8 @@ impl Inputs {
     pub fn of_files(source: Option<&Path>, target: &Path, extra: Option<&Path>, own: &Own) -> Result<Self> {
         let options = own.load_options();
         let table = |path: &Path| Table::read(path, &options);
-        let (target, source, extra) = (table(target)?, source.map(table).transpose()?, extra.map(table).transpose()?);
+        let (target, source) = (table(target)?, source.map(table).transpose()?);
+        let extra = extra.map(|path| Table::besides(path, &options, &target)).transpose()?;
         let (agent, limit) = (own.agent(), own.step_limit.map(|n| n as usize));
         Self { agent, shift: None, target, source, extra, actions: None, limit }.checked(own)
     }
@@ -362,8 +400,31 @@ impl Inputs {
                 );
             }
         }
+        self.refuse_mixed_up()?;
         self.bring_into_the_box(own)?;
         Ok(self)
+    }
+
+    /// Refuses a source that is the target, and warns of one that is smaller: files get mixed up.
+    fn refuse_mixed_up(&self) -> Result<()> {
+        let Some(source) = &self.source else { return Ok(()) };
+        if source.hash == self.target.hash {
+            return Err(Error::Usage(format!(
+                "{} and {}: found the same data as source and as target; give the log of the old robot as source, and that of the \
+                 changed one as target",
+                source.file.display(),
+                self.target.file.display()
+            )));
+        }
+        let (many, few) = (source.complete().len(), self.target.complete().len());
+        if many < few {
+            eprintln!(
+                "warning: the source ({}) has {many} rows, fewer than the target ({}) with {few}; are the two mixed up?",
+                source.file.display(),
+                self.target.file.display()
+            );
+        }
+        Ok(())
     }
 
     /// What identifies these inputs; with `source` left out for stages that do not look at it.
@@ -410,20 +471,42 @@ impl Inputs {
     }
 }
 
+/// Where the data of a task come from.
+enum Origin {
+    /// A file that is there.
+    File(PathBuf),
+    /// Actors that collect it.
+    Collected(Recipe),
+}
+
+fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
+    let Task { agent, shift, target, .. } = task;
+    let public = task.target_file(&shared_folder());
+    match &args.target {
+        Some(path) => Ok(Origin::File(path.clone())),
+        None if !args.from_zoo && public.exists() => Ok(Origin::File(public)),
+        None => {
+            let recipe = zoo::cast(agent, shift)?.target(agent, shift, target, 0);
+            Ok(Origin::Collected(recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?))
+        }
+    }
+}
+
+fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
+    match &args.source {
+        Some(path) => Ok(Origin::File(path.clone())),
+        None => Ok(Origin::Collected(d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?)),
+    }
+}
+
 /// The target data of a task, collected now if it has to be; see [`Inputs::of_task`].
 ///
 /// # Errors
 /// If the zoo lacks an actor, or the rows cannot be written.
 pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
-    let Task { agent, shift, target, .. } = task;
-    let public = task.target_file(&shared_folder());
-    match &args.target {
-        Some(path) => Ok(path.clone()),
-        None if !args.from_zoo && public.exists() => Ok(public),
-        None => {
-            let recipe = zoo::cast(agent, shift)?.target(agent, shift, target, 0);
-            collected(&recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?, target, args)
-        }
+    match target_origin(task, args)? {
+        Origin::File(path) => Ok(path),
+        Origin::Collected(recipe) => collected(&recipe, task.target, args),
     }
 }
 
@@ -432,10 +515,26 @@ pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
 /// # Errors
 /// As for [`target_file`].
 pub fn source_file(task: Task, args: &DataArgs, rows: usize) -> Result<PathBuf> {
-    match &args.source {
-        Some(path) => Ok(path.clone()),
-        None => collected(&d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?, task.source, args),
+    match source_origin(task, args, rows)? {
+        Origin::File(path) => Ok(path),
+        Origin::Collected(recipe) => collected(&recipe, task.source, args),
     }
+}
+
+/// Whether the data of a task can be had; of the source only where `source_rows` are needed. Nothing is collected.
+///
+/// # Errors
+/// What is missing, and where it was looked for.
+pub fn ensure_data(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<()> {
+    let origins = std::iter::once(target_origin(task, args)).chain(source_rows.map(|n| source_origin(task, args, n)));
+    for origin in origins {
+        if let Origin::File(path) = origin?
+            && !path.exists()
+        {
+            return Err(Error::missing(&path, format!("there is no such file; {task} needs it")));
+        }
+    }
+    Ok(())
 }
 
 fn collected(recipe: &Recipe, quality: Quality, args: &DataArgs) -> Result<PathBuf> {

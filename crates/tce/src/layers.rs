@@ -8,12 +8,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use tce_base::FileError;
 use tce_data::{Agent, Quality, Shift, Task};
 use toml::{Table, Value};
 
 use crate::config::{Algorithm, Config};
 use crate::error::{Error, Result};
 use crate::variant::Variant;
+use crate::wrong_keys::{did_you_mean_key, in_words};
 
 const DEFAULT: &str = include_str!("../presets/default.toml");
 const PAPER: &str = include_str!("../presets/paper.toml");
@@ -79,7 +81,8 @@ impl Layered {
         }
         if let Some(path) = file {
             let name = path.display().to_string();
-            let text = std::fs::read_to_string(path).map_err(|e| Error::Usage(format!("{name}: cannot read: {e}")))?;
+            let text =
+                std::fs::read_to_string(path).map_err(|e| Error::Usage(FileError::new(path, "read", e).to_string()))?;
             layered.merge_into(parse(&text, &name)?, &name, Some(&known))?;
         }
         for set in sets {
@@ -120,7 +123,10 @@ impl Layered {
             let origin = self.origin.iter().find(|(key, _)| path.starts_with(key.as_str()) || key.starts_with(&path));
             let origin = origin.map_or("the configuration", |(_, o)| o);
             let reason = e.inner().to_string();
-            Error::Usage(format!("{origin}: key `{path}`: {}", reason.lines().next().unwrap_or_default().trim()))
+            Error::Usage(format!(
+                "{origin}: key `{path}`: {}",
+                in_words(reason.lines().next().unwrap_or_default().trim())
+            ))
         })?;
         config.validate()?;
         Ok(config)
@@ -173,8 +179,12 @@ fn merge(
     for (key, value) in layer {
         let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
         if known.is_some_and(|k| !k.contains_key(&key)) {
-            let expected: Vec<_> = known.into_iter().flat_map(|k| k.keys().map(String::as_str)).collect();
-            return Err(Error::Usage(format!("{name}: unknown key `{path}`; expected one of {}", expected.join(", "))));
+            let siblings: Vec<_> = known.into_iter().flat_map(|k| k.keys().map(String::as_str)).collect();
+            let hint = did_you_mean_key(&key, prefix, &siblings, &parse(DEFAULT, "preset default")?);
+            return Err(Error::Usage(format!(
+                "{name}: unknown key `{path}`; expected one of {}{hint}",
+                siblings.join(", ")
+            )));
         }
         match value {
             Value::Table(inner) => {

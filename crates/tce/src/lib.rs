@@ -4,6 +4,7 @@ mod acting;
 mod actors;
 mod bench;
 mod commands;
+mod conclusion;
 mod config;
 mod diagnosis;
 mod error;
@@ -32,10 +33,18 @@ mod units;
 mod variant;
 mod verdict;
 mod video;
+mod wrong_keys;
 mod zoo;
 
 /// What files say about who wrote them.
 const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));
+
+/// An error as the terminal shows it: its own words, once. They hold what caused it, so that the chain of causes would say it again.
+pub fn report(error: Error) -> miette::Report {
+    // A second call, in a test, finds the hook set.
+    let _ = miette::set_hook(Box::new(|_| Box::new(miette::MietteHandlerOpts::new().without_cause_chain().build())));
+    miette::Report::new(error)
+}
 
 pub use commands::Cli;
 pub use error::{Error, Result};

@@ -47,8 +47,14 @@ pub struct Tried {
     pub floor: bool,
     /// Imagined return, mean over the seeds.
     pub imagined_return: f64,
+    /// Standard error of it, over the imagined episodes of the policies' mean.
+    #[serde(default)]
+    pub standard_error: f64,
     /// Share of the steps of whole episodes that were reached, mean over the seeds.
     pub survival: f64,
+    /// RMSE of the actions at target states against the behaviour's, mean over the seeds; the box is 2 wide.
+    #[serde(default)]
+    pub action_error: f64,
     /// Imagined return less that of the standard, and its standard error.
     pub over_standard: [f64; 2],
 }
@@ -82,17 +88,19 @@ fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
     [mean, std / (differences.len().max(1) as f64).sqrt()]
 }
 
-/// Tries all candidates and recommends one. The learned dynamics are asked for only where there is a choice.
+/// The verdict where there is no choice: one candidate with one policy.
+pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
+    let [Candidate { name, files, .. }] = candidates else { return None };
+    let [policy] = &files[..] else { return None };
+    let reason = format!("{name} is the only policy there is.");
+    Some(Verdict { method: name.clone(), policy: policy.clone(), sure: true, reason, tried: Vec::new() })
+}
+
+/// Tries all candidates in learned dynamics and recommends one.
 ///
 /// # Errors
 /// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
 pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]) -> Result<Verdict> {
-    if let [Candidate { name, files, .. }] = candidates
-        && let [policy] = &files[..]
-    {
-        let reason = format!("{name} is the only policy there is.");
-        return Ok(Verdict { method: name.clone(), policy: policy.clone(), sure: true, reason, tried: Vec::new() });
-    }
     let judge = judge()?;
     let try_all =
         |c: &Candidate| -> Result<Vec<Judged>> { c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect() };
@@ -130,15 +138,19 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
             if by >= 0.0 { "it is ahead by" } else { "it is behind by" },
             name(k),
         ),
-        _ => format!("{} is the only policy.", name(chosen)),
+        _ => format!("{} is the only method there is.", name(chosen)),
     };
     let seed = (0..judged[chosen].len())
         .max_by(|&a, &b| judged[chosen][a].imagined_return.total_cmp(&judged[chosen][b].imagined_return));
+    let of_seeds =
+        |k: usize, figure: &dyn Fn(&Judged) -> f64| mean_std(&judged[k].iter().map(figure).collect::<Vec<_>>()).0;
     let tried = |k: usize| Tried {
         name: candidates[k].name.clone(),
         floor: candidates[k].floor,
         imagined_return: mean(k),
-        survival: mean_std(&judged[k].iter().map(|j| j.survival).collect::<Vec<_>>()).0,
+        standard_error: difference(&returns[k], &vec![0.0; returns[k].len()])[1],
+        survival: of_seeds(k, &|j| j.survival),
+        action_error: of_seeds(k, &|j| j.action_error),
         over_standard: over[k],
     };
     Ok(Verdict {

@@ -266,3 +266,96 @@ fn check_says_on_one_screen_what_was_made_of_a_file() {
     }
     assert!(text.lines().count() < 24, "one screen:\n{text}");
 }
+
+/// `augment` writes the target rows, too. `learn` has them already, and takes the generated ones of that file alone.
+#[test]
+fn rows_of_augment_are_not_learned_from_twice() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    pair(dir, &arm(3, 2, (4, 60), 1.0, 1), &arm(3, 2, (2, 40), 1.0, 2));
+    let (rows, _) = augment(dir, &[]);
+    let learn = |extra: &str, out: &str| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", extra, "--out", out, "--no-verdict"];
+        tce(dir, &[&args[..], TINY].concat())
+    };
+    let whole = learn("out.hdf5", "whole");
+    assert!(whole.status.success(), "{}", message(&whole));
+    let words = format!("80 of its {} rows are target rows and are left out", rows.len());
+    assert!(message(&whole).contains(&words), "{}", message(&whole));
+    // Without the column that says so (Minari has none) the same rows are found by their numbers.
+    save(dir, "plain.hdf5", &rows);
+    let plain = learn("plain.hdf5", "plain");
+    assert!(message(&plain).contains(&words), "{}", message(&plain));
+    // The generated rows alone: the same policy.
+    save(dir, "generated.hdf5", &rows.select(&(80..rows.len()).collect::<Vec<_>>()));
+    let generated = learn("generated.hdf5", "generated");
+    assert!(!message(&generated).contains("left out"), "{}", message(&generated));
+    let policy = |out: &str| std::fs::read(dir.join(out).join("policy-seed0.safetensors")).unwrap();
+    assert!(policy("whole") == policy("generated") && policy("whole") == policy("plain"));
+}
+
+/// Nobody can roll out a robot that has no simulator: what learned dynamics tell of the policy stands in the table instead.
+#[test]
+fn learn_says_what_a_policy_is_worth_without_a_simulator() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    pair(dir, &arm(3, 2, (4, 60), 1.0, 1), &arm(3, 2, (2, 40), 1.0, 2));
+    let args = ["learn", "--target", "target.hdf5", "--source", "source.hdf5", "--out", "out"];
+    let output = tce(dir, &[&args[..], TINY].concat());
+    assert!(output.status.success(), "{}", message(&output));
+    let text = String::from_utf8_lossy(&output.stdout);
+    for words in ["imagined return", "±", "action error", "recommended policy: out/policy.safetensors"] {
+        assert!(text.contains(words), "no {words:?} in:\n{text}");
+    }
+    assert!(!text.contains("score"), "{text}");
+}
+
+#[test]
+fn files_that_are_mixed_up_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    pair(dir, &arm(3, 2, (1, 30), 1.0, 1), &arm(3, 2, (2, 40), 1.0, 2));
+    let (_, told) = augment(dir, &[]);
+    assert!(
+        told.contains("the source (source.hdf5) has 30 rows, fewer than the target (target.hdf5) with 80"),
+        "{told}"
+    );
+    // The same rows under another name are the same file.
+    std::fs::copy(dir.join("target.hdf5"), dir.join("copy.hdf5")).unwrap();
+    let output = tce(dir, &["augment", "--source", "copy.hdf5", "--target", "target.hdf5", "--out", "same.hdf5"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(message(&output).contains("found the same data as source and as target"), "{}", message(&output));
+}
+
+/// Results have no place in a sweep's folder, and a sweep none in another's.
+#[test]
+fn a_sweeps_folder_is_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    save(dir, "target.hdf5", &arm(3, 2, (2, 40), 1.0, 2));
+    std::fs::write(
+        dir.join("s.toml"),
+        "tasks = [\"hopper-morph/medium/expert\"]\nvariants = [\"bc\"]\nfloors = false\n",
+    )
+    .unwrap();
+    assert!(tce(dir, &["sweep", "plan", "s.toml", "--out", "s"]).status.success());
+    for args in [
+        &["learn", "--target", "target.hdf5", "--out", "s/runs/mine"][..],
+        &["run", "hopper-morph/medium/expert", "--out", "s"],
+        &["sweep", "plan", "s.toml", "--out", "s/inner"],
+    ] {
+        let output = tce(dir, args);
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+        assert!(message(&output).contains("found the folder of a"), "{args:?}: {}", message(&output));
+    }
+    // Every task's data are looked for when the sweep is planned.
+    std::fs::write(
+        dir.join("t.toml"),
+        "tasks = [\"hopper-morph/medium/medium-expert\", \"ant-gravity/medium/expert\"]\nvariants = [\"bc\"]\n\
+        [data.\"ant-gravity/medium/expert\"]\ntarget = \"gone.hdf5\"\n",
+    )
+    .unwrap();
+    let lacking = tce(dir, &["sweep", "plan", "t.toml", "--out", "t"]);
+    assert!(!lacking.status.success() && message(&lacking).contains("gone.hdf5"), "{}", message(&lacking));
+    assert!(!dir.join("t").exists());
+}

@@ -160,13 +160,21 @@ fn a_failure_is_kept_and_the_rest_is_done() {
     assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
     let launched = tce(dir.path(), &["sweep", "launch", "s", "--workers", "2", "--retries", "0"]);
     assert_eq!(launched.status.code(), Some(1));
-    let status = tce_json(dir.path(), &["sweep", "status", "s"]);
+    let told = message(&launched);
+    // Three pieces fail for one cause, which is told once on the way and once in the end.
+    assert_eq!(told.matches("z_threshold").count(), 1, "{told}");
+    let shown = tce(dir.path(), &["sweep", "status", "s", "--json"]);
+    assert_eq!(shown.status.code(), Some(1), "a sweep with failures is not well");
+    let status: serde_json::Value = serde_json::from_slice(&shown.stdout).unwrap();
     assert_eq!(status["kinds"]["run"], serde_json::json!([1, 3]), "{status}");
+    assert!(status["seconds_left"].is_null(), "{status}");
     let failed = status["failed"].as_array().unwrap();
     assert_eq!(failed.len(), 3);
     assert!(failed[0][1].as_str().unwrap().contains("z_threshold"), "{failed:?}");
     let shown = tce(dir.path(), &["sweep", "status", "s"]);
-    assert!(String::from_utf8_lossy(&shown.stdout).contains("3 failed"));
+    let text = String::from_utf8_lossy(&shown.stdout);
+    assert!(text.contains("3 failed") && text.contains("what failed keeps the sweep from its end"), "{text}");
+    assert_eq!(text.matches("z_threshold").count(), 1, "equal messages are one: {text}");
 }
 
 /// Scripts in place of Slurm's programs.

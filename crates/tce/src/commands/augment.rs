@@ -57,6 +57,7 @@ impl Augment {
         super::refuse_existing(&self.out, self.writing.force)?;
         super::refuse_inputs(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
+        super::refuse_folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;

@@ -21,7 +21,7 @@ use crate::output::{Output, plus_minus, table};
 use crate::own::Own;
 use crate::pipeline::seeds;
 use crate::processor::Processor;
-use crate::verdict::{Candidate, Kept, keep, recommend};
+use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -102,6 +102,7 @@ impl Learn {
                 method.name
             )));
         }
+        super::refuse_folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target_file, self.extra.as_deref(), &self.own)?;
@@ -154,7 +155,10 @@ impl Learn {
                 let floor =
                     extra.is_some().then(|| floor(alone, &config, &seeds, place, &inputs, device)).transpose()?;
                 let judge = || Judge::train(&inputs, &config.dynamics, &out, device);
-                let verdict = recommend(judge, &floor.into_iter().chain([own]).collect::<Vec<_>>())?;
+                let candidates: Vec<_> = floor.into_iter().chain([own]).collect();
+                // Without a simulator a single policy is tried, too: nothing else tells what it is worth.
+                let alone = self.own.env.and_then(|_| only(&candidates));
+                let verdict = alone.map_or_else(|| recommend(judge, &candidates), Ok)?;
                 Some(keep(verdict, &out)?)
             }
         };
@@ -213,15 +217,21 @@ fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Report>> {
 }
 
 fn render(report: &Report) -> String {
-    let rows = report.policies.iter().enumerate().map(|(m, path)| {
-        let evaluation = report.learned.evaluations.get(m);
-        [
-            path.display().to_string(),
-            evaluation.filter(|e| e.failed.is_none()).map_or("-".into(), |e| plus_minus(&e.returns)),
-            evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
-        ]
-    });
-    let mut text = table(&["policy", "return", "score"], rows);
+    let mut text = String::new();
+    // Without a simulator there are no returns, and a table of dashes says nothing.
+    if report.learned.evaluations.iter().any(|e| e.failed.is_none()) {
+        let rows = report.policies.iter().enumerate().map(|(m, path)| {
+            let evaluation = report.learned.evaluations.get(m);
+            [
+                path.display().to_string(),
+                evaluation.filter(|e| e.failed.is_none()).map_or("-".into(), |e| plus_minus(&e.returns)),
+                evaluation.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
+            ]
+        });
+        text += &table(&["policy", "return", "score"], rows);
+    } else {
+        text.extend(report.policies.iter().map(|p| format!("{}\n", p.display())));
+    }
     for (m, seed) in report.seeds.iter().enumerate() {
         let broken = report.learned.figures.iter().filter(|(_, values)| values.get(m).is_some_and(Option::is_none));
         let names: Vec<_> = broken.map(|(name, _)| name.as_str()).collect();
@@ -230,8 +240,21 @@ fn render(report: &Report) -> String {
         }
     }
     if let Some(kept) = &report.verdict {
-        text += "\n";
-        text += &kept.sentences();
+        let rows = kept.verdict.tried.iter().map(|t| {
+            [
+                if t.floor { format!("{} (baseline)", t.name) } else { t.name.clone() },
+                format!("{:.1} ± {:.1}", t.imagined_return, t.standard_error),
+                format!("{:.0} %", 100.0 * t.survival),
+                format!("{:.3}", t.action_error),
+            ]
+        });
+        let header = ["policy", "imagined return", "of an episode survived", "action error"];
+        text += &format!(
+            "\nTried in learned dynamics of the robot, no simulator needed (± standard error):\n{}\n\
+             action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n\n{}",
+            table(&header, rows),
+            kept.sentences()
+        );
     }
     text
 }

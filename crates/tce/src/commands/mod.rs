@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use clap::{Parser, Subcommand};
+use tce_base::{ensure_folder, ensure_writable};
 
 use crate::error::{Error, Result};
 use crate::output::Output;
@@ -116,6 +117,18 @@ impl Cli {
     }
 }
 
+/// Refuses a folder for results that cannot be written, or that lies in a sweep's, whose files are all accounted for.
+fn refuse_folder(out: &Path) -> Result<()> {
+    match crate::sweep::around(&out.join("x")) {
+        Some(sweep) => Err(Error::Usage(format!(
+            "--out {}: found the folder of a sweep, {}; what lies there is the sweep's own. Choose another folder",
+            out.display(),
+            sweep.display()
+        ))),
+        None => Ok(ensure_folder(out)?),
+    }
+}
+
 /// Refuses to write over what is read.
 fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
     let same = |input: &&&Path| out.canonicalize().is_ok_and(|out| input.canonicalize().is_ok_and(|i| i == out));
@@ -131,6 +144,7 @@ fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
 
 /// An output that exists is only replaced when the user says so.
 fn refuse_existing(path: &Path, force: bool) -> Result<()> {
+    ensure_writable(path)?;
     if path.exists() && !force {
         return Err(Error::Usage(format!(
             "{} exists; choose another name, or say --force to replace it",

@@ -6,6 +6,7 @@ use tce_data::Task;
 use tce_learn::{DynamicsConfig, LabelErrors};
 use tce_nn::Device;
 
+use crate::conclusion::{self, Scored};
 use crate::config::Algorithm;
 use crate::error::{Error, Result};
 use crate::inputs::{Behaviour, DataArgs, Inputs};
@@ -14,12 +15,12 @@ use crate::layers::ConfigArgs;
 use crate::output::{Output, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
 use crate::variant::Variant;
-use crate::verdict::{Candidate, Kept, keep, recommend};
+use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
 pub struct Run {
-    /// The task: AGENT-SHIFT:SOURCE->TARGET, as in 'hopper-morph:medium->expert' (quote it: > is the shell's).
+    /// The task: ROBOT-SHIFT/SOURCE/TARGET, as in hopper-morph/medium/expert.
     task: Task,
     /// The methods, separated by commas.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "tce-og")]
@@ -48,13 +49,15 @@ pub struct Run {
 
 #[derive(Serialize)]
 struct Report {
-    task: Task,
+    task: String,
     source: Option<Behaviour>,
     target: Behaviour,
     rows: Vec<Row>,
     /// The recommended policy; None where `--no-verdict` was said.
     #[serde(skip_serializing_if = "Option::is_none")]
     verdict: Option<Kept>,
+    /// What came out, in sentences.
+    conclusion: Vec<String>,
 }
 
 #[derive(Serialize)]
@@ -91,6 +94,7 @@ impl Run {
             })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
+        super::refuse_folder(&self.data.out)?;
         // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
         let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);
         let inputs = Inputs::of_config(self.task, &self.data, widest)?;
@@ -105,7 +109,15 @@ impl Run {
             false => Some(self.verdict(&inputs, &rows, &configs[0].dynamics, device)?),
         };
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
-        output.print(&Report { task: self.task, source, target, rows, verdict }, render);
+        let scored = |row: &Row| Scored {
+            name: row.title.clone(),
+            floor: row.floor,
+            scores: row.summary.scores.iter().flatten().copied().collect(),
+        };
+        let recommended = verdict.as_ref().map(|v| v.verdict.method.as_str());
+        let scored: Vec<_> = rows.iter().map(scored).collect();
+        let conclusion = conclusion::sentences(&scored, recommended, self.config.preset);
+        output.print(&Report { task: self.task.to_string(), source, target, rows, verdict, conclusion }, render);
         Ok(())
     }
 }
@@ -116,7 +128,9 @@ impl Run {
         let candidate =
             |row: &Row| Candidate { name: row.title.clone(), floor: row.floor, files: row.summary.policies() };
         let judge = || Judge::train(inputs, dynamics, &self.data.out, device);
-        let verdict = recommend(judge, &rows.iter().map(candidate).collect::<Vec<_>>())?;
+        let candidates: Vec<_> = rows.iter().map(candidate).collect();
+        // The simulator has judged a single policy already.
+        let verdict = only(&candidates).map_or_else(|| recommend(judge, &candidates), Ok)?;
         keep(verdict, &self.data.out.join(self.task.directory()))
     }
 }
@@ -180,15 +194,20 @@ fn render(report: &Report) -> String {
         text += &table(&header, generated);
         text += "\n";
     }
-    if let Some(kept) = &report.verdict {
-        text += &kept.sentences();
-        text += "\n";
-    }
     for row in &report.rows {
         text += &format!("{}: {}\n", row.title, row.summary.directory.display());
     }
     for (name, b) in report.source.iter().map(|b| ("source", b)).chain([("target", &report.target)]) {
         text += &format!("{name} rows: {}\n", b.file.display());
+    }
+    // Last, where the eye is when the command ends.
+    text += "\n";
+    for sentence in &report.conclusion {
+        text += &format!("{sentence}\n");
+    }
+    if let Some(kept) = &report.verdict {
+        text += &kept.sentences();
+        text += "\n";
     }
     text
 }

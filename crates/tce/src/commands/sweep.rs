@@ -156,6 +156,13 @@ impl Plan {
             run: count(Kind::Run),
             directory,
         };
+        if let Some(other) = crate::sweep::around(&planned.directory) {
+            return Err(Error::Usage(format!(
+                "--out {}: found the folder of another sweep, {}; choose a folder outside of it",
+                planned.directory.display(),
+                other.display()
+            )));
+        }
         if !self.dry_run {
             Sweep::create(&planned.directory, manifest)?;
         }
@@ -231,10 +238,7 @@ impl Launch {
                 output.print(&status, |s| s.render());
                 match failed {
                     0 => Ok(()),
-                    n => Err(Error::Failed(format!(
-                        "{n} pieces of work failed; their messages are in {}/failed",
-                        self.directory.display()
-                    ))),
+                    _ => status.healthy(),
                 }
             }
         }
@@ -284,15 +288,15 @@ impl StatusArgs {
             let status = sweep.status()?;
             if !self.watch {
                 output.print(&status, |s| s.render());
-                return Ok(());
+                return status.healthy();
             }
             let mut out = std::io::stdout().lock();
             // On a terminal the next look takes the place of the last one.
             let clear = if out.is_terminal() { "\x1b[H\x1b[2J" } else { "" };
             let _ = write!(out, "{clear}{}", status.render()).and_then(|()| out.flush());
             drop(out);
-            if status.complete() {
-                return Ok(());
+            if status.complete() || status.stuck() {
+                return status.healthy();
             }
             let until = std::time::Instant::now() + Duration::from_secs_f64(self.every.clamp(0.1, 3600.0));
             while std::time::Instant::now() < until {

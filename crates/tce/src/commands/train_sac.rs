@@ -47,9 +47,22 @@ pub struct TrainSac {
     /// Updates of the critics alone, before the policy's first.
     #[arg(long, default_value_t = 0)]
     policy_start: u64,
+    /// With --from: share of uniformly random actions until the policy's first update. They tell the critics what other actions do.
+    #[arg(long, default_value_t = 0.0)]
+    explore: f64,
+    /// Layer normalisation in the critics: they then promise nothing extreme of actions that nobody tried.
+    #[arg(long)]
+    critic_norm: bool,
     /// The temperature α before the first update. A trained policy wants less than a new one.
     #[arg(long, default_value_t = 1.0)]
     temperature: f64,
+    /// The entropy that α keeps the policy at (default: minus the number of actions). A trained policy has less, and loses its
+    /// gait where it has to gain it back.
+    #[arg(long, allow_hyphen_values = true)]
+    target_entropy: Option<f64>,
+    /// The policy's learning rate (default: the critics', 3e-4).
+    #[arg(long)]
+    policy_lr: Option<f64>,
     /// Steps before the first update: uniformly random, or the policy's of --from.
     #[arg(long, default_value_t = 10_000)]
     start: u64,
@@ -86,12 +99,16 @@ struct Row {
 impl TrainSac {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        let counts = [self.seeds, self.episodes as u64, self.evaluate_every, self.start, self.steps_per_update];
+        let counts =
+            [self.steps, self.seeds, self.episodes as u64, self.evaluate_every, self.start, self.steps_per_update];
         if counts.contains(&0) || self.batch == 0 {
-            let message =
-                "--seeds, --episodes, --evaluate-every, --start, --steps-per-update and --batch must be at least 1";
+            let message = "--steps, --seeds, --episodes, --evaluate-every, --start, --steps-per-update and --batch must be at least 1";
             return Err(Error::Usage(message.into()));
         }
+        if !(0.0..=1.0).contains(&self.explore) {
+            return Err(Error::Usage(format!("--explore {}: expected a share from 0 to 1", self.explore)));
+        }
+        super::refuse_folder(&self.out)?;
         let goal = Goal {
             steps: self.steps,
             until: self.until_score,
@@ -112,6 +129,7 @@ impl TrainSac {
                     seed,
                     start: self.start,
                     steps_per_update: self.steps_per_update,
+                    explore: self.explore,
                     batch: self.batch,
                     from: None,
                     evaluate_every: self.evaluate_every,
@@ -119,6 +137,9 @@ impl TrainSac {
                     sac: SacConfig {
                         policy_start: self.policy_start,
                         initial_alpha: self.temperature,
+                        layer_norm: self.critic_norm,
+                        target_entropy: self.target_entropy,
+                        policy_lr: self.policy_lr,
                         ..SacConfig::default()
                     },
                 };

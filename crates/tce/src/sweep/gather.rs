@@ -9,8 +9,10 @@ use tce_base::first_damaged;
 
 use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
+use crate::conclusion::{Scored, Tally};
 use crate::error::{Error, Result};
 use crate::output::{plus_minus, table};
+use crate::variant::Variant;
 
 /// One finished run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -136,6 +138,21 @@ impl Gathered {
         Err(Error::Failed(text))
     }
 
+    /// For every method that is no baseline: on how many tasks it is above and below the best baseline, and where by more than seeds do.
+    fn sentences(&self, tasks: &[&str], methods: &[&str], cells: &BTreeMap<(&str, &str), Vec<f64>>) -> Vec<String> {
+        // Without floors there is nothing to be above of.
+        let floor = |method: &str| Variant::FLOORS.iter().any(|f| method.split(' ').next() == Some(f.name().as_str()));
+        let of = |method: &str| {
+            Tally::of(tasks.iter().map(|task| {
+                let scored =
+                    |m: &str| cells.get(&(*task, m)).filter(|s| !s.is_empty()).map(|s| Scored::new(m, floor(m), s));
+                let floors: Vec<Scored> = methods.iter().filter(|m| floor(m)).filter_map(|m| scored(m)).collect();
+                (scored(method), floors)
+            }))
+        };
+        methods.iter().filter(|m| !floor(m)).filter_map(|m| of(m).map(|tally| tally.sentence(m))).collect()
+    }
+
     /// Tasks × methods: mean ± standard deviation over seeds.
     pub fn render(&self) -> String {
         let mut methods: Vec<&str> = Vec::new();
@@ -156,6 +173,9 @@ impl Gathered {
             std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect::<Vec<_>>()
         });
         let mut text = table(&header, rows);
+        for sentence in self.sentences(&tasks, &methods, &cells) {
+            text += &format!("\n{sentence}");
+        }
         let problems = self.missing.len() + self.corrupt.len() + self.conflicts.len();
         if problems > 0 {
             text += &format!(

@@ -37,6 +37,8 @@ impl Sweep {
         let mut todo: BTreeSet<usize> = self.missing()?.iter().map(|e| e.index).collect();
         let progress = Progress::new("sweep", todo.len() as u64, "pieces of work");
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
+        // The last message of each piece: one that fails twice in the same words fails a third time, too.
+        let mut messages: BTreeMap<usize, String> = BTreeMap::new();
         let mut running: BTreeMap<usize, Child> = BTreeMap::new();
         let mut failed = 0;
         while !(todo.is_empty() && running.is_empty()) {
@@ -69,9 +71,19 @@ impl Sweep {
                 }
                 let tries = tries.entry(index).or_default();
                 *tries += 1;
-                let reason = self.failure(entry).map_or_else(|| status.to_string(), |f| f.error);
-                eprintln!("{entry}: failed ({reason}); its log: {}", self.log(entry).display());
-                if *tries <= share.retries {
+                let words = self.failure(entry).map(|f| f.error);
+                let reason = words.clone().unwrap_or_else(|| status.to_string());
+                let before = messages.insert(index, reason.clone());
+                // Many pieces fail for one cause: it is told once.
+                let told =
+                    messages.iter().any(|(i, m)| *i != index && *m == reason) || before.as_ref() == Some(&reason);
+                match told {
+                    false => eprintln!("{entry}: failed: {reason}; its log: {}", self.log(entry).display()),
+                    true => eprintln!("{entry}: failed, with the same message"),
+                }
+                // A process that was killed has no words, and is tried as often as was said.
+                let again = words.is_none() || before != words;
+                if again && *tries <= share.retries {
                     todo.insert(index);
                 } else {
                     failed += 1;

@@ -25,7 +25,7 @@ use tce_data::{Task, main_file};
 use crate::PROGRAM;
 use crate::config::{Config, GeneratedRows, SourceRows};
 use crate::error::{Error, Result};
-use crate::inputs::DataArgs;
+use crate::inputs::{DataArgs, ensure_data};
 use crate::layers::{Layered, Preset};
 use crate::variant::Variant;
 
@@ -39,6 +39,8 @@ pub mod work;
 /// More runs than anybody has machines for are a slip of the finger.
 const MOST_RUNS: u64 = 100_000;
 /// Changes when manifests of before cannot be read.
+/// The list of work in a sweep's folder.
+const MANIFEST: &str = "manifest.jsonl";
 const FORMAT: u32 = 1;
 
 /// A sweep's description, `sweep.toml`: tasks × variants × overrides × seeds.
@@ -191,6 +193,20 @@ pub struct Header {
     pub entries: usize,
 }
 
+impl Header {
+    /// Where the data of a task come from.
+    fn data_of(&self, task: Task) -> DataArgs {
+        let Files { source, target } = self.data.get(&task).cloned().unwrap_or_default();
+        DataArgs { source, target, from_zoo: self.from_zoo, out: PathBuf::new() }
+    }
+}
+
+/// The sweep in whose folder `path` lies, or would lie; none outside of all.
+pub fn around(path: &Path) -> Option<PathBuf> {
+    let whole = std::path::absolute(path).ok()?;
+    whole.ancestors().skip(1).find(|p| p.join(MANIFEST).is_file()).map(Path::to_owned)
+}
+
 /// The list of work of a sweep.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Manifest {
@@ -216,7 +232,7 @@ impl Manifest {
     /// [`Error::Usage`] for a description that cannot be read, an unknown key, task or setting, or files that are not there.
     pub fn plan(path: &Path) -> Result<Self> {
         let failed = |e: &dyn fmt::Display| Error::Usage(format!("{}: {e}", path.display()));
-        let text = fs::read_to_string(path).map_err(|e| failed(&e))?;
+        let text = fs::read_to_string(path).map_err(|e| Error::Usage(FileError::new(path, "read", e).to_string()))?;
         let description: Description = toml::from_str(&text).map_err(|e| failed(&e))?;
         let base = path.parent().unwrap_or(Path::new("."));
         let tasks = tasks(&description.tasks).map_err(|e| failed(&e))?;
@@ -259,17 +275,27 @@ impl Manifest {
         }
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
+        let mut lacking: Vec<String> = Vec::new();
         for &task in &tasks {
             for &variant in &variants {
                 for Override { name, set } in overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
+                    let args = plan.header.data_of(task);
+                    if let Err(e) = ensure_data(task, &args, config.needs_source().then_some(config.source.rows)) {
+                        lacking.push(e.to_string());
+                    }
                     for seed in description.first_seed..description.first_seed + description.seeds {
                         plan.add_run(&mut known, task, variant, name, &config, seed);
                     }
                 }
             }
+        }
+        lacking.sort();
+        lacking.dedup();
+        if !lacking.is_empty() {
+            return Err(Error::Failed(format!("{}: not all data can be had:\n{}", path.display(), lacking.join("\n"))));
         }
         Ok(plan.sorted())
     }
@@ -431,12 +457,15 @@ fn tasks(patterns: &[String]) -> Result<Vec<Task>, String> {
     let mut out: Vec<Task> = Vec::new();
     for pattern in patterns {
         let found: Vec<Task> = if pattern.contains('*') {
-            Task::all().into_iter().filter(|t| glob(pattern, &t.to_string())).collect()
+            Task::all()
+                .into_iter()
+                .filter(|t| glob(pattern, &t.to_string()) || glob(pattern, &t.with_arrow()))
+                .collect()
         } else {
             vec![pattern.parse()?]
         };
         if found.is_empty() {
-            return Err(format!("tasks: `{pattern}` matches none of the 108 tasks AGENT-SHIFT:SOURCE->TARGET"));
+            return Err(format!("tasks: `{pattern}` matches none of the 108 tasks ROBOT-SHIFT/SOURCE/TARGET"));
         }
         out.extend(found.into_iter().filter(|t| !out.contains(t)).collect::<Vec<_>>());
     }
@@ -461,7 +490,7 @@ impl Sweep {
     /// # Errors
     /// If another manifest is there: work that is done belongs to it.
     pub fn create(directory: &Path, manifest: Manifest) -> Result<Self> {
-        let path = directory.join("manifest.jsonl");
+        let path = directory.join(MANIFEST);
         let text = manifest.to_jsonl();
         match read_if_there(&path)? {
             Some(old) if old == text.as_bytes() => {}
@@ -481,7 +510,7 @@ impl Sweep {
     /// # Errors
     /// If there is none, or its manifest is damaged.
     pub fn open(directory: &Path) -> Result<Self> {
-        let path = directory.join("manifest.jsonl");
+        let path = directory.join(MANIFEST);
         let text = fs::read_to_string(&path).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => {
                 Error::Usage(format!("{}: no sweep here; plan one with `tce sweep plan`", directory.display()))
@@ -524,13 +553,7 @@ impl Sweep {
     }
 
     fn data(&self, entry: &Entry) -> DataArgs {
-        let files = self.manifest.header.data.get(&entry.task).cloned().unwrap_or_default();
-        DataArgs {
-            source: files.source,
-            target: files.target,
-            from_zoo: self.manifest.header.from_zoo,
-            out: self.directory.join("runs"),
-        }
+        DataArgs { out: self.directory.join("runs"), ..self.manifest.header.data_of(entry.task) }
     }
 
     /// A file about a piece of work, in one of the folders of the [module's](self) table.

@@ -2,13 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
 use super::work::{Active, Failure, now};
 use super::{Entry, Kind, Sweep};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::output::{plus_minus, table};
 
 /// Without a sign of life for so long, a process counts as lost.
@@ -25,11 +26,14 @@ pub struct Status {
     pub running: Vec<Running>,
     /// Indices of what failed and is neither done nor at work.
     pub failed: Vec<(usize, String)>,
+    /// Where the logs are.
+    pub logs: PathBuf,
     /// Indices of what is neither done, at work nor failed.
     pub waiting: Vec<usize>,
     /// Results that came later and differ.
     pub faults: usize,
-    /// Seconds until everything is done, if as many stay at work as now; None as long as nothing is done of what is left.
+    /// Seconds until everything is done, if as many stay at work as now; None as long as nothing is done of what is left, where
+    /// something failed, and where nobody is at work.
     pub seconds_left: Option<f64>,
     /// Scores so far: task, method, scores.
     pub scores: Vec<(String, String, Vec<f64>)>,
@@ -60,6 +64,7 @@ impl Sweep {
             kinds: BTreeMap::new(),
             running: Vec::new(),
             failed: Vec::new(),
+            logs: self.directory.join("logs"),
             waiting: Vec::new(),
             faults: fs::read_dir(self.directory.join("faults")).map_or(0, Iterator::count),
             seconds_left: None,
@@ -97,7 +102,9 @@ impl Sweep {
         }
         let known = times.values().all(|&(_, done, left)| done > 0 || left == 0);
         let work: f64 = times.values().map(|&(seconds, done, left)| seconds / done.max(1) as f64 * left as f64).sum();
-        status.seconds_left = known.then(|| work / status.running.len().max(1) as f64);
+        // What failed may fail again, and what nobody does takes for ever.
+        let known = known && status.failed.is_empty() && !status.running.is_empty();
+        status.seconds_left = known.then(|| work / status.running.len() as f64);
         status.scores = scores.into_iter().map(|((task, column), scores)| (task, column, scores)).collect();
         Ok(status)
     }
@@ -130,6 +137,40 @@ impl Status {
         self.kinds.get(&Kind::Run).is_none_or(|(done, all)| done == all)
     }
 
+    /// Whether what is left will not get done: something failed, and nobody is at work.
+    pub fn stuck(&self) -> bool {
+        !self.failed.is_empty() && self.running.is_empty()
+    }
+
+    /// Nothing, unless something failed.
+    ///
+    /// # Errors
+    /// How much failed, and what to do.
+    pub fn healthy(&self) -> Result<()> {
+        match self.failed.len() {
+            0 => Ok(()),
+            n => Err(Error::Failed(format!(
+                "{n} {} failed, with the message{} above; mend the cause and launch the sweep again (logs: {})",
+                if n == 1 { "piece of work" } else { "pieces of work" },
+                if n == 1 { "" } else { "s" },
+                self.logs.display()
+            ))),
+        }
+    }
+
+    /// What failed, by message: the first line, and the numbers of the work, in the order of the first of each.
+    pub fn failures(&self) -> Vec<(&str, Vec<usize>)> {
+        let mut groups: Vec<(&str, Vec<usize>)> = Vec::new();
+        for (index, error) in &self.failed {
+            let first = error.lines().next().unwrap_or_default();
+            match groups.iter_mut().find(|(message, _)| *message == first) {
+                Some((_, indices)) => indices.push(*index),
+                None => groups.push((first, vec![*index])),
+            }
+        }
+        groups
+    }
+
     /// As a text for a terminal.
     pub fn render(&self) -> String {
         let word = |kind: &Kind| match kind {
@@ -144,7 +185,9 @@ impl Status {
         let left = match (self.complete(), self.seconds_left) {
             (true, _) => "all runs are done".to_owned(),
             (false, Some(s)) => format!("about {:.0} min left", (s / 60.0).ceil()),
-            (false, None) => "time left not known yet".to_owned(),
+            (false, None) if self.stuck() => "what failed keeps the sweep from its end".to_owned(),
+            (false, None) if self.running.is_empty() => "nobody is at work (tce sweep launch)".to_owned(),
+            (false, None) => "time left not known".to_owned(),
         };
         text += &format!(
             "{} at work, {} waiting, {} failed, {} faults of determinism; {left}\n",
@@ -156,8 +199,10 @@ impl Status {
         for r in &self.running {
             text += &format!("  {} (for {} s, {})\n", r.what, r.seconds, r.owner);
         }
-        for (index, error) in self.failed.iter().take(10) {
-            text += &format!("  failed {index}: {}\n", error.lines().next().unwrap_or_default());
+        for (message, indices) in self.failures() {
+            let first = indices.iter().take(5).map(ToString::to_string).collect::<Vec<_>>().join(", ");
+            let more = if indices.len() > 5 { ", ..." } else { "" };
+            text += &format!("  failed, {} of the work ({first}{more}): {message}\n", indices.len());
         }
         if !self.scores.is_empty() {
             let rows = self.scores.iter().map(|(t, c, s)| [t.clone(), c.clone(), plus_minus(s), s.len().to_string()]);

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use hdf5_pure::{AttrValue, Dataset, Datatype, File, FormatError};
-use tce_base::FileError;
+use tce_base::{FileError, file_inside};
 
 use self::names::{Broken, Found, Names};
 use self::storage::Unwritten;
@@ -75,7 +75,9 @@ impl Hdf5 {
         let io = |action| move |e: io::Error| DataError::File(FileError::new(path, action, e));
         let meta = fs::metadata(path).map_err(io("open"))?;
         if meta.is_dir() {
-            return Err(io("open")(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory, not a file")));
+            let inside = file_inside(path, |p| p.extension().is_some_and(|e| e == "hdf5" || e == "h5"));
+            let words = format!("it is a folder, not a file{inside}");
+            return Err(io("open")(io::Error::new(io::ErrorKind::IsADirectory, words)));
         }
         let bytes = meta.len();
         let whole = |problem, found: String, advice: &str| {
