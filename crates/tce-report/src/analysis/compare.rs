@@ -76,6 +76,7 @@ pub(super) fn compare(
         methods.push(Aggregate {
             method: m,
             runs: scores.runs(),
+            seeds: scores.tasks().iter().fold((usize::MAX, 0), |(l, h), t| (l.min(t.len()), h.max(t.len()))),
             over_seeds: [runs[0], runs[1], runs[2], runs[3]],
             over_tasks: [both[0], both[1], both[2], both[3]],
             total: runs[4],

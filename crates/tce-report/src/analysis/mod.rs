@@ -11,7 +11,14 @@ use crate::stats::{Bootstrap, Draw, Estimate, Scores};
 use crate::study::{Method, Run, Study, order};
 
 mod compare;
+mod opening;
+mod recipes;
+mod recommended;
 mod warnings;
+
+pub use opening::{gap_words, opening, verdict_words};
+pub use recipes::{Recipes, thousands};
+pub use recommended::Recommendation;
 
 /// A diverged policy counts as much as a random one. Left out, it would flatter its method.
 pub const DIVERGED: f64 = 0.0;
@@ -104,6 +111,8 @@ pub struct ShiftTable {
     pub paper_totals: Vec<(f64, usize)>,
     /// Ours beside the paper's.
     pub against: Vec<Against>,
+    /// Why ours and the paper's may not be comparable; None where nothing speaks against it.
+    pub doubt: Option<String>,
 }
 
 /// Statistics of one method over the compared tasks.
@@ -113,6 +122,8 @@ pub struct Aggregate {
     pub method: usize,
     /// Runs.
     pub runs: usize,
+    /// Fewest and most seeds of a task.
+    pub seeds: (usize, usize),
     /// Interquartile mean, median, mean, optimality gap, with intervals over seeds.
     pub over_seeds: [Estimate; 4],
     /// The same with intervals over tasks and seeds.
@@ -160,7 +171,7 @@ pub enum Finding {
     Open,
     /// The interval lies on one side of one half, but with so few runs chance alone often does that.
     Few,
-    /// There is no interval.
+    /// There is one seed, and so no interval.
     Unknown,
 }
 
@@ -169,10 +180,10 @@ impl Finding {
     pub fn word(self) -> &'static str {
         match self {
             Finding::Better => "beats it",
-            Finding::Worse => "falls short of it",
-            Finding::Open => "no difference shown",
-            Finding::Few => "too few runs to tell",
-            Finding::Unknown => "one seed: cannot be told",
+            Finding::Worse => "falls short",
+            Finding::Open => "not proved",
+            Finding::Few => "too few runs",
+            Finding::Unknown => "one seed",
         }
     }
 }
@@ -199,6 +210,10 @@ pub struct Analysis {
     pub tables: Vec<ShiftTable>,
     /// Methods beside each other; None without a score.
     pub comparison: Option<Comparison>,
+    /// Presets and learner updates of the runs.
+    pub recipes: Recipes,
+    /// What the recommended policies came to.
+    pub recommendations: Vec<Recommendation>,
     /// What a reader must know.
     pub warnings: Vec<Warning>,
     /// The intervals' coverage.
@@ -241,6 +256,17 @@ impl Comparison {
     /// The best floor's place among the methods.
     pub fn best_floor(&self) -> Option<usize> {
         self.best_floor.map(|k| self.floors[k])
+    }
+
+    /// The best floor's figures.
+    pub fn standard(&self) -> Option<&Aggregate> {
+        self.best_floor().and_then(|m| self.methods.iter().find(|a| a.method == m))
+    }
+
+    /// Points by which the interquartile mean of `aggregate` is above that of the best floor; None for floors.
+    pub fn gap(&self, aggregate: &Aggregate) -> Option<f64> {
+        aggregate.over_floors.as_ref()?;
+        Some(aggregate.over_seeds[0].point - self.standard()?.over_seeds[0].point)
     }
 }
 
@@ -296,6 +322,8 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
         published,
         tables,
         comparison,
+        recipes: Recipes::of(study),
+        recommendations: recommended::recommendations(study),
         warnings,
         level: options.level,
         resamples: options.resamples,
@@ -390,5 +418,6 @@ fn shift_table(
             figures.fold((0.0, 0), |(sum, n), p| (sum + p.mean, n + 1))
         })
         .collect();
-    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against })
+    let doubt = recipes::doubt(study, shift, &against);
+    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against, doubt })
 }

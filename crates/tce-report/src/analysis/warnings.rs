@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use tce_data::Task;
 
-use super::{Aggregate, Comparison, DIVERGED, ENOUGH_SEEDS, Finding, Warning};
+use super::{Aggregate, Comparison, DIVERGED, ENOUGH_SEEDS, Finding, Warning, gap_words};
 use crate::folder::Verdict;
 use crate::study::{Run, Study};
 
@@ -88,10 +88,10 @@ pub(super) fn warnings(
         if *least < ENOUGH_SEEDS {
             warn(
                 format!(
-                    "Few seeds: {} a task and method, where the paper has {ENOUGH_SEEDS}. Intervals from so few seeds are too \
+                    "Few seeds: {} for each task and method, where the paper has {ENOUGH_SEEDS}. Intervals from so few seeds are too \
                      narrow{}.",
                     if least == most { least.to_string() } else { format!("{least} to {most}") },
-                    if *least == 1 { ", and a task with one seed adds nothing to them" } else { "" },
+                    if *least == 1 { ", and a task with one seed does not widen them" } else { "" },
                 ),
                 Vec::new(),
             );
@@ -99,8 +99,7 @@ pub(super) fn warnings(
         if least != most {
             warn(
                 format!(
-                    "Unequal numbers of seeds, {least} to {most}. Every task has the same weight, and a run the share of its \
-                     task's."
+                    "Unequal numbers of seeds, {least} to {most}. Every task counts the same in a mean, however many runs it has."
                 ),
                 Vec::new(),
             );
@@ -119,7 +118,10 @@ pub(super) fn warnings(
         let part = |(title, n): (&&str, &usize)| format!("{title} on {n} of {}", tasks.len());
         let parts: Vec<String> = bare.iter().map(part).collect();
         warn(
-            format!("Floors are missing: {}. A score says little without the floor it has to beat.", parts.join("; ")),
+            format!(
+                "Baselines are missing: {}. A score says little without the baselines it has to beat.",
+                parts.join("; ")
+            ),
             Vec::new(),
         );
     }
@@ -129,7 +131,7 @@ pub(super) fn warnings(
             if c.tasks.len() < tasks.len() {
                 warn(
                     format!(
-                        "Aggregates are over the {} of {} tasks on which every compared method has a score.",
+                        "Means over tasks are of the {} of {} tasks on which every compared method has a score.",
                         c.tasks.len(),
                         tasks.len()
                     ),
@@ -139,24 +141,33 @@ pub(super) fn warnings(
             if !c.left_out.is_empty() {
                 warn(
                     format!(
-                        "Not in the aggregates, for lack of scores on more than half of the tasks: {}.",
+                        "Left out of the means over tasks, for lack of scores on more than half of the tasks: {}.",
                         list(c.left_out.iter().map(|m| title(*m)))
                     ),
                     Vec::new(),
                 );
             }
-            let finding = |wanted: Finding| -> Vec<&str> {
+            let finding = |wanted: Finding| -> Vec<String> {
                 let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);
-                c.methods.iter().filter(is).map(|a| title(a.method)).collect()
+                let gap = |a: &Aggregate| match gap_words(c.gap(a).unwrap_or(f64::NAN)) {
+                    level if level.starts_with("level") => "level".to_owned(),
+                    gap => gap,
+                };
+                c.methods.iter().filter(is).map(|a| format!("{} ({})", title(a.method), gap(a))).collect()
             };
             if let Some(floor) = c.best_floor() {
                 let worse = finding(Finding::Worse);
                 let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
                 if !worse.is_empty() {
-                    warn(format!("Below the best floor ({}): {}.", title(floor), list(worse)), Vec::new());
+                    let names = list(worse.iter().map(String::as_str));
+                    warn(format!("Shown to fall short of the best baseline, {}: {names}.", title(floor)), Vec::new());
                 }
                 if !open.is_empty() {
-                    warn(format!("Not shown to beat the best floor ({}): {}.", title(floor), list(open)), Vec::new());
+                    let names = list(open.iter().map(String::as_str));
+                    warn(
+                        format!("Not proved to differ from the best baseline, {}: {names}.", title(floor)),
+                        Vec::new(),
+                    );
                 }
             }
         }

@@ -54,19 +54,22 @@ pub(super) fn coverage(d: &Diagnosis) -> Markup {
         let value = d.covered_by_target.and_then(of);
         d.bounds_of_y.iter().map(|b| value.and_then(|v| bare(b.y_max, v))).collect::<Vec<_>>()
     };
-    let others =
-        if d.covered_by_fresh { "the same by rows of other target episodes" } else { "the same by other target rows" };
+    let second = if d.covered_by_fresh { "other target episodes" } else { "other target rows" };
     figure(
         "Coverage",
-        "of states, by generated rows",
+        "share of real states that are reached",
         ("y_max", y_axis(d)),
         "share",
         false,
         vec![
-            line("target states", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
-            line(others, "f0", without(&|c| Some(c.target)).into_iter()),
-            line("source states", "m1", over(&|b| b.coverage.and_then(|c| c.source)).into_iter()),
-            line(others, "f1", without(&|c| c.source).into_iter()),
+            line("target states, by generated rows", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
+            line(
+                &format!("target states, by {second} (good: as high)"),
+                "f0",
+                without(&|c| Some(c.target)).into_iter(),
+            ),
+            line("source states, by generated rows", "m1", over(&|b| b.coverage.and_then(|c| c.source)).into_iter()),
+            line(&format!("source states, by {second} (good: above it)"), "f2", without(&|c| c.source).into_iter()),
         ],
     )
 }
@@ -77,20 +80,20 @@ pub(super) fn copies(d: &Diagnosis) -> Markup {
     };
     figure(
         "Copies",
-        "rows that pass the filter, against held-out rows",
+        "how often a row that passes the filter is nearer to a training row than a held-out row is",
         ("y_max", y_axis(d)),
-        "P(nearer to training rows)",
+        "share of comparisons",
         false,
         vec![
             line("generated rows", "m0", over(&|m| m.probability).into_iter()),
-            line("copies", "f1", over(&|m| m.of_copies).into_iter()),
-            line("fresh rows", "f0", over(&|_| 0.5).into_iter()),
+            line("if all were copies", "m1", over(&|m| m.of_copies).into_iter()),
+            line("fresh rows (good)", "f0", over(&|_| 0.5).into_iter()),
         ],
     )
 }
 
 pub(super) fn reliability(d: &Diagnosis) -> Markup {
-    let few = format!("{} against abundant target rows", d.target_rows);
+    let few = format!("a model of {} target rows against one of many simulated rows", d.target_rows);
     type Get = fn(&Reliability) -> Option<Spread>;
     let panels: [(&str, &str, &str, bool, Get); 5] = [
         ("Distance of ŝ", "to the nearest real state", "standard deviations", false, |r| r.distance),
@@ -190,8 +193,12 @@ pub(super) fn histograms(d: &Diagnosis) -> Markup {
             }
         }
     };
+    let mut labels = vec![steps("kept", "m0", &s.y_kept)];
+    if s.y_rejected.counts.iter().any(|c| *c > 0) {
+        labels.push(steps("rejected", "m1", &s.y_rejected));
+    }
     html! {
-        (panel("ŷ", "of rows at the run's own y_max", "ŷ", None, &[steps("kept", "m0", &s.y_kept), steps("rejected", "m1", &s.y_rejected)]))
+        (panel("ŷ", "of rows at the run's own y_max", "ŷ", None, &labels))
         (panel("Largest |z|", "over the dimensions of (s, s')", "z", d.z_threshold, &[
             steps("generated", "m0", &s.z),
             steps("real target rows", "f0", &s.z_real),
@@ -220,10 +227,10 @@ pub(super) fn theorem(b: &Bounds) -> Markup {
             unit,
             false,
             vec![
-                curve("nearest source rows", "m0", truth, |c| &c.nearest),
-                curve("all source rows", "m1", truth, |c| &c.all),
-                doubted("nearest, by the data alone", "m0 again", alone),
-                curve("all, by the data alone", "m1 again", alone, |c| &c.all),
+                curve("nearest source rows, by the simulator", "m0", truth, |c| &c.nearest),
+                curve("all source rows, by the simulator", "m1", truth, |c| &c.all),
+                doubted("nearest source rows, by the data alone", "m2", alone),
+                curve("all source rows, by the data alone", "m3", alone, |c| &c.all),
             ],
         )
     };

@@ -6,7 +6,7 @@ use tce_diagnosis::{Choice, Diagnosis};
 
 use super::plain;
 use crate::analysis::Analysis;
-use crate::html::counted;
+use crate::html::{counted, term};
 use crate::study::{Study, short};
 use crate::svg::minus;
 
@@ -76,10 +76,10 @@ pub(super) fn lambdas(study: &Study, analysis: &Analysis, all: &[&Diagnosis]) ->
     html! {
         h3 { "λ from the data alone" }
         p {
-            "The rule takes the λ with the least bound of Theorem 1 on values, measured by models of the target rows alone. Where the bounds \
-             differ by no more than these models and the samples are in doubt, it cannot tell, and λ = 0 stands by default. Beside it, what the simulator \
-             would have said, and in hindsight the mixture of this study with the highest mean score, where there are two that differ in \
-             λ alone."
+            (term("lambda", "λ")) " is the share of real source rows in the data that a policy learns from. The rule takes the λ at which "
+            (term("theorem", "Theorem 1")) " promises the least loss, measured by models of the target rows alone. Where the promises differ by \
+             less than these models and the samples are in doubt, the data cannot tell, and λ = 0 stands. Beside it stands what the \
+             simulator would have said. The last columns are hindsight: the scores of this report's mixtures that differ in λ alone."
         }
         div class="scroll" {
             table {

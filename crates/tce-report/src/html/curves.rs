@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use maud::{Markup, html};
 use tce_data::Task;
 
-use super::{classes, decades};
+use super::{classes, decades, term};
 use crate::analysis::Analysis;
 use crate::study::{Study, shift_title, short};
 use crate::svg::{self, Axis, Frame, Line, Point, Series};
@@ -86,7 +86,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
         html! { div class="keys" { @for s in series.iter().filter(used) { (svg::key(s)) } } }
     };
     html! {
-        p { "Lines are means over seeds, bands reach from the lowest to the highest seed." }
+        p { "Lines are means over " (term("seed", "seeds")) ", bands reach from the lowest to the highest seed." }
         @if on_the_way {
             h3 { "Score during training" }
             (keys(&scores))
@@ -102,7 +102,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
         } @else {
             h3 { "Policy loss" }
             p class="note" {
-                "The algorithms' losses are not on one scale: compare the course of a line, not the height of two."
+                "Different algorithms have losses on different scales: follow one line over time, and do not compare the height of two."
             }
             (keys(&losses))
             (panels(&losses, if positive { "policy loss (logarithmic)" } else { "policy loss" }, positive))

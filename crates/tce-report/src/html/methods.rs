@@ -2,6 +2,7 @@
 
 use maud::{Markup, html};
 
+use super::term;
 use crate::analysis::Analysis;
 
 pub(super) fn methods(analysis: &Analysis) -> Markup {
@@ -12,10 +13,10 @@ pub(super) fn methods(analysis: &Analysis) -> Markup {
              settings name (" code { "evaluation.scores" } ")."
         }
         p {
-            b { "Floors. " }
+            b { "Baselines (floors). " }
             "Cloning of the target rows with raw and with standardised observations, cloning of the best half of the trajectories, and \
-             IQL on the target rows alone. The best floor is the one with the highest interquartile mean on the compared tasks; it is \
-             chosen after the fact, which is to the methods' disadvantage if anything."
+             implicit Q-learning (IQL) on the target rows alone. The best baseline is the one with the highest interquartile mean on the \
+             compared tasks. It is chosen by its scores, which favours the baselines."
         }
         p {
             b { "Statistics. " }
@@ -26,22 +27,23 @@ pub(super) fn methods(analysis: &Analysis) -> Markup {
         }
         p {
             b { "Findings. " }
-            "A method beats the best floor, or falls short of it, if the interval of its probability of improvement lies on one side of one \
-             half, and a permutation test, which deals each task's runs out to both anew, reaches p ≤ " (format!("{:.2}", 1.0 - analysis.level))
-            ". The test is there because a bootstrap of few runs can shrink to a point: two runs above two others are nothing \
-             extraordinary, for all that the interval says."
+            "A method beats the best baseline, or falls short of it, on two conditions. The interval of its "
+            (term("improvement", "probability of improvement")) " lies on one side of one half. And a "
+            (term("p", "permutation test")) ", which deals each task's runs out to both methods anew, reaches p ≤ "
+            (format!("{:.2}", 1.0 - analysis.level)) ". The test is needed because the interval of few runs can shrink to a point: that two \
+             runs score higher than two others happens by chance in one of six cases."
         }
         p {
             b { "Missing and failed runs. " }
-            "A run that is not done, or whose files are not what they were, is counted nowhere, and listed above. A policy that diverged \
-             is a result: it counts as 0 points, a random policy's score. Methods are compared only on tasks that all of them have; where \
+            "A run that is not done, or whose files have changed, is counted nowhere, and listed above. A policy that "
+            (term("diverged", "diverged")) " is a result: it counts as 0 points, a random policy's score. Methods are compared only on tasks that all of them have; where \
              that is fewer than half of what the fullest method has, the method with the fewest tasks is left out, and named. With unequal numbers of seeds every task \
-             keeps its weight, and its runs share it."
+             counts the same."
         }
         p {
             b { "What the intervals do not say. " }
-            "They are one by one, not for all methods at once: of twenty true ties one is expected to look like a difference. With few \
-             seeds they are too narrow. Tasks that share a robot or a data set are not independent of each other."
+            "Each interval is of one method, not of all at once: among twenty methods that are equal to the baseline, one is expected to \
+             look different. With few seeds the intervals are too narrow. Tasks that share a robot or a data set are not independent of each other."
         }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
-use crate::analysis::Analysis;
+use crate::analysis::{Analysis, opening};
 use crate::stats::Estimate;
 use crate::study::{Study, shift_title};
 use crate::svg::{Axis, Series, minus};
@@ -12,13 +12,13 @@ use crate::svg::{Axis, Series, minus};
 mod cost;
 mod curves;
 mod findings;
-mod headline;
 mod methods;
 mod runs;
 mod scores;
 mod statistics;
+mod words;
 
-pub(crate) use headline::headline;
+pub(crate) use words::term;
 
 /// The page's text.
 pub fn page(study: &Study, analysis: &Analysis) -> String {
@@ -33,7 +33,10 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
         ("methods", "How the figures are made", methods::methods(analysis)),
     ];
     if !study.diagnoses.is_empty() {
-        sections.insert(3, ("diagnoses", "Generated rows and λ", crate::diagnosis::section(study, analysis)));
+        sections.insert(
+            3,
+            ("diagnoses", "Generated rows and real source rows", crate::diagnosis::section(study, analysis)),
+        );
     }
     if let Some(section) = crate::sensitivity::section(study, analysis) {
         sections.insert(2, ("sensitivity", "Sensitivity", section));
@@ -43,19 +46,18 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
         (warnings(analysis))
         nav aria-label="Sections" {
             @for (id, title, _) in &sections { a href=(format!("#{id}")) { (title) } }
+            a href="#words" { "Words" }
         }
         @for (id, title, body) in &sections {
             section id=(id) { h2 { (title) } (body) }
-        }
-        footer class="note" {
-            "Made by " (concat!("tce ", env!("CARGO_PKG_VERSION"))) " from " code { (study.directory) } "."
         }
     };
     document(&title, body)
 }
 
-/// A whole page around `body`.
+/// A whole page around `body`, with the words that it links to explained at its end.
 pub(crate) fn document(title: &str, body: Markup) -> String {
+    let words = words::list(&body.0);
     let markup = html! {
         (DOCTYPE)
         html lang="en" {
@@ -67,7 +69,13 @@ pub(crate) fn document(title: &str, body: Markup) -> String {
                 title { (title) }
                 style { (PreEscaped(include_str!("../page.css"))) }
             }
-            body { main { (body) } }
+            body {
+                main {
+                    (body)
+                    section id="words" { h2 { "Words" } (words) }
+                    footer class="note" { "Made by " (concat!("tce ", env!("CARGO_PKG_VERSION"))) "." }
+                }
+            }
         }
     };
     markup.into_string()
@@ -87,6 +95,11 @@ fn estimate(e: &Estimate, decimals: usize) -> Markup {
     html! { (minus(format!("{:.decimals$}", e.point))) " " small { (range(e.interval, decimals)) } }
 }
 
+/// With its sign.
+fn signed(value: f64) -> String {
+    if value > 0.0 { format!("+{value:.1}") } else { one(value) }
+}
+
 fn said(e: &Estimate, decimals: usize) -> String {
     format!("{} {}", minus(format!("{:.decimals$}", e.point)), range(e.interval, decimals)).trim_end().to_owned()
 }
@@ -99,7 +112,7 @@ pub(crate) fn counted(n: usize, one: &str, many: &str) -> String {
 fn classes(analysis: &Analysis) -> Vec<Series> {
     let (mut floors, mut others) = (0, 0);
     let class = |m: &crate::study::Method| {
-        let (count, letter, hues) = if m.floor { (&mut floors, 'f', 4) } else { (&mut others, 'm', 8) };
+        let (count, letter, hues) = if m.floor { (&mut floors, 'f', 5) } else { (&mut others, 'm', 8) };
         let k = *count;
         *count += 1;
         let again = if k >= hues { " again" } else { "" };
@@ -123,14 +136,31 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
     let all = study.runs.len() + study.missing.len();
     let hours = study.runs.iter().map(|r| r.folder.seconds / r.folder.members.len() as f64).sum::<f64>();
     let shifts: Vec<String> = analysis.tables.iter().map(|t| shift_title(t.shift).to_lowercase()).collect();
+    let presets = analysis.recipes.presets.len();
+    let sentences = opening(analysis);
     html! {
         header {
             p class="eyebrow" { (if study.sweep { "Sweep" } else { "Runs" }) " · " (shifts.join(" · ")) }
             h1 { (study.name) }
-            p class="lede" { (headline(analysis)) }
+            p class="lede" { (sentences[0]) }
+            @for text in &sentences[1..] { p { (text) } }
+            @if analysis.comparison.is_some() {
+                p class="note" {
+                    "Points are of the " (term("score", "normalised score")) ": a random policy has 0, an expert of the target robot 100. A "
+                    (term("baseline", "baseline")) " is a simple method that a result has to beat. Methods are compared by their "
+                    (term("iqm", "interquartile mean")) ", the mean of the middle half of their runs; a run is one policy of one "
+                    (term("seed", "seed")) "."
+                    @if !analysis.recommendations.is_empty() {
+                        " A recommendation is made from the data alone; its " (term("regret", "regret"))
+                        " is what a choice by the scores would have brought in addition."
+                    }
+                }
+            }
             ul class="facts" {
+                li { b { (analysis.recipes.names()) } (term("preset", if presets == 1 { "preset" } else { "presets" })) }
+                @if let Some(updates) = analysis.recipes.updates() { li { b { (updates) } (term("updates", "learner updates")) } }
                 li { b { (tasks.len()) } (if tasks.len() == 1 { "task" } else { "tasks" }) }
-                li { b { (analysis.methods.len() - floors) " + " (floors) } "methods + floors" }
+                li { b { (analysis.methods.len() - floors) " + " (floors) } "methods + baselines" }
                 li { b { (seeds.len()) } (if seeds.len() == 1 { "seed" } else { "seeds" }) }
                 li { b { (study.runs.len()) " / " (all) } "runs with a result" }
                 li { b { (duration(hours)) } "run time in all" }

@@ -5,10 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use maud::{Markup, html};
 use tce_data::Task;
 
-use super::{counted, duration, one};
+use super::{counted, duration, one, term};
 use crate::analysis::score;
 use crate::folder::Verdict;
-use crate::study::{Run, Study, order};
+use crate::study::{Recipe, Run, Study, order};
 use crate::svg::minus;
 
 pub(super) fn runs(study: &Study) -> Markup {
@@ -21,7 +21,10 @@ pub(super) fn runs(study: &Study) -> Markup {
         entry.1.insert(&run.method);
     }
     html! {
-        p { "Every score with what decided it: seed, configuration, hashes of data and results, and the program." }
+        p {
+            "Every score with what decided it: seed, settings, hashes of data and results, and the program. The runs lie in "
+            code { (study.directory) } "."
+        }
         @for task in &tasks {
             @let list: Vec<&Run> = study.methods.iter().flat_map(|m| study.runs.iter().filter(move |r| r.task == *task && r.method == m.id)).collect();
             details {
@@ -41,10 +44,32 @@ pub(super) fn runs(study: &Study) -> Markup {
             }
         }
         h3 { "Settings" }
+        p class="note" {
+            "Some names: " code { "expectile" } " is " (term("expectile", "that of IQL")) "; " code { "y_max" } " bounds "
+            (term("y", "the labels ŷ of generated states")) "; " code { "lambda" } " is " (term("lambda", "the share of source rows"))
+            "; " code { "z_threshold" } " is " (term("filter", "the filter's")) "."
+        }
         @for (hash, (text, methods)) in &configs {
             details id=(format!("config-{hash}")) {
                 summary { code { (hash) } " · " (methods.iter().copied().collect::<Vec<_>>().join(", ")) }
-                div class="inner" { pre { (text) } }
+                div class="inner" {
+                    @if let Some(run) = study.runs.iter().find(|r| r.folder.config_hash == **hash) { (recipe(&run.recipe)) }
+                    pre { (text) }
+                }
+            }
+        }
+    }
+}
+
+/// Where settings come from.
+fn recipe(recipe: &Recipe) -> Markup {
+    html! {
+        @match (&recipe.preset, &recipe.changed[..]) {
+            (None, _) => p class="note" { "These settings are like none of the presets." },
+            (Some(preset), []) => p class="note" { "The settings of preset " (preset) "." },
+            (Some(preset), changed) => {
+                p class="note" { "Preset " (preset) ", but for these (in brackets the preset's):" }
+                ul class="note" { @for c in changed { li { code { (c) } } } }
             }
         }
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use maud::{Markup, html};
 
-use super::{counted, estimate, one, range, title_cell};
+use super::{counted, estimate, one, range, signed, term, title_cell};
 use crate::analysis::{Analysis, Cell, ShiftTable, Total};
 use crate::study::{agent_title, shift_title};
 
@@ -30,9 +30,9 @@ fn cell(cell: Option<&Cell>, class: &str) -> Markup {
 pub(super) fn tables(analysis: &Analysis) -> Markup {
     html! {
         p {
-            "Normalised scores: 0 is a random policy, 100 the expert of the target domain. Mean ± standard deviation over seeds. "
-            span class="above" {} "above every floor of the task; " b { "bold" } ": highest mean of ours. "
-            "Shaded columns are the paper's own figures, over five seeds of other code."
+            (term("score", "Normalised scores")) ", mean ± standard deviation over " (term("seed", "seeds")) ". "
+            span class="above" {} "marks a mean above that of every " (term("baseline", "baseline")) " of the task, " b { "bold" }
+            " the highest mean of ours. Shaded columns are the figures that the paper prints."
         }
         @for t in &analysis.tables { (shift_table(analysis, t)) }
     }
@@ -58,7 +58,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
         beside.extend(column.map(Column::Paper));
     }
     let groups: [(&str, Vec<Column>); 3] = [
-        ("Floors", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
+        ("Baselines", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
         (if used.is_empty() { "Methods" } else { "Methods, ours and the paper's" }, beside),
         ("Others in the paper", (0..papers.len()).filter(|c| !used.contains(c)).map(Column::Paper).collect()),
     ];
@@ -87,6 +87,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
     };
     html! {
         h3 { (shift_title(t.shift)) }
+        @if let Some(doubt) = &t.doubt { p class="doubt" { (doubt) } }
         div class="scroll" {
             table {
                 thead {
@@ -148,7 +149,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
             }
         }
         @if !t.against.is_empty() {
-            p class="note" { "Totals of a method and of the paper's column of its name, over the tasks that have both:" }
+            p class="note" { "Sums over tasks, of a method and of the paper's column of its name, for the tasks that have both:" }
             div class="scroll" {
                 table {
                     thead {
@@ -175,8 +176,4 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
             @for note in &paper.notes { p class="note" { (note) } }
         }
     }
-}
-
-fn signed(value: f64) -> String {
-    if value > 0.0 { format!("+{value:.1}") } else { one(value) }
 }

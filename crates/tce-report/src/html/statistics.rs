@@ -2,7 +2,7 @@
 
 use maud::{Markup, html};
 
-use super::{classes, percent};
+use super::{classes, percent, term};
 use crate::analysis::{Aggregate, Analysis};
 use crate::svg::{self, Axis, Frame, Interval, Line, Point};
 
@@ -56,8 +56,8 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
     let ends = [c.thresholds[0], c.thresholds[c.thresholds.len() - 1]];
     html! {
         p {
-            "Dots are the figures of the runs as they are. Thick lines: " (percent(analysis)) " intervals when seeds are drawn anew "
-            "within every task, that is, what other seeds would have given. Thin lines: tasks are drawn anew, too."
+            "Dots are the figures of the runs as they are. Thick lines are " (percent(analysis)) " " (term("interval", "bootstrap intervals"))
+            ": the range that other seeds might have given. Thin lines are wider, because other tasks are drawn as well."
         }
         div class="panels" {
             (panel(0, "Interquartile mean", "mean of the middle half of all runs"))
@@ -65,7 +65,16 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
             (panel(1, "Median", "over tasks, of the mean over seeds"))
             (panel(3, "Optimality gap", "mean shortfall from 100; lower is better"))
         }
+        p class="note" {
+            "The " (term("gap", "optimality gap")) " is the mean shortfall from 100. The " (term("iqm", "interquartile mean"))
+            " leaves out the lowest and the highest quarter of the runs."
+        }
         h3 { "Performance profiles and probability of improvement" }
+        p class="note" {
+            "A " (term("profile", "performance profile")) " shows which share of the runs is above every score: farther to the right is \
+             better. The " (term("improvement", "probability of improvement")) " is the share of pairs, a run of the method and one of the \
+             best baseline, in which the method's run scores higher: one half, the dashed line, is no difference."
+        }
         div class="panels" {
             figure {
                 figcaption { "Runs above a score " span { "bands: " (percent(analysis)) ", over seeds" } }
@@ -80,10 +89,10 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
             }
             @if let (Some(floor), false) = (c.best_floor(), better.is_empty()) {
                 figure {
-                    figcaption { "Probability of outscoring the best floor " span { (analysis.methods[floor].title) } }
+                    figcaption { "Probability of improvement on the best baseline " span { (analysis.methods[floor].title) } }
                     (svg::intervals("Probability of improvement", &better,
                         &Axis::fixed(0.0, 1.0, &[0.0, 0.25, 0.5, 0.75, 1.0]),
-                        "probability that a run outscores a run of the floor", Some(0.5), 2))
+                        "share of pairs in which the method is higher", Some(0.5), 2))
                 }
             }
         }
