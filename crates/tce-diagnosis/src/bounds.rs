@@ -279,6 +279,21 @@ impl fmt::Display for Choice {
 }
 
 impl Choice {
+    /// What to do with the source rows.
+    pub fn sentence(&self) -> String {
+        match self {
+            Choice { told: false, .. } => {
+                "The data do not tell whether real source rows should be added to them. By default none are (λ = 0)."
+                    .into()
+            }
+            Choice { lambda: 0.0, .. } => "Add no real source rows to them: the data alone speak for λ = 0.".into(),
+            Choice { lambda, .. } => format!(
+                "Add the nearest source rows to them: the data alone speak for a share of {}, λ = {lambda}.",
+                crate::advice::percent(*lambda)
+            ),
+        }
+    }
+
     /// The rule.
     pub fn of(curve: &Curve) -> Self {
         let best = (0..GRID.len()).min_by(|&a, &b| curve.nearest[a].total_cmp(&curve.nearest[b])).expect("a grid");

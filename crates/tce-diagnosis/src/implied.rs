@@ -133,7 +133,7 @@ impl Implied {
         if let Some(e) = self.actions.trained {
             text += &format!(
                 "The action that the generator implies at real states differs from the behaviour's by {:.3}{}; the behaviour's actions \
-                 spread by {:.3}, and {:.3} is the fault of the inverse dynamics model alone.",
+                 spread by {:.3}, and the inverse dynamics model alone errs by {:.3}.",
                 e.single,
                 self.actions.held_out.map_or(String::new(), |h| format!(" ({:.3} at rows held out)", h.single)),
                 e.spread,

@@ -9,8 +9,10 @@
 //! | Which policy do generated rows imply? How do their errors grow away from the data? | [`implied`] |
 //! | How far are two transition models apart? (Fig. 3 b.2) | [`gaussian`] |
 //! | What does Theorem 1 say, and which λ does it choose? | [`bounds`] |
+//! | Should these rows be used, and why? | [`advice`] |
 //! | Everything about one run | [`Diagnosis`] |
 
+pub mod advice;
 pub mod bounds;
 pub mod coverage;
 mod diagnosis;
@@ -20,6 +22,7 @@ pub mod implied;
 pub mod memorisation;
 mod numbers;
 
+pub use advice::{Advice, Answer};
 pub use bounds::{Bounds, Choice, Curve, MeanError, Part, Rated};
 pub use coverage::Coverage;
 pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};

@@ -20,7 +20,7 @@ pub use analysis::{Analysis, Options, analyse};
 pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use study::{Cost, Method, Missing, Run, Study};
+pub use study::{Budget, Cost, Method, Missing, Recipe, Recommended, Run, Study};
 
 use std::path::{Path, PathBuf};
 

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use maud::{Markup, html};
 
 use crate::analysis::Analysis;
+use crate::html::term;
 use crate::study::{Method, Study, short};
 use crate::svg::{self, Axis, Frame, Line, Point, Series};
 
@@ -69,7 +70,10 @@ pub fn section(study: &Study, analysis: &Analysis) -> Option<Markup> {
         all.iter().enumerate().filter_map(of).collect()
     };
     Some(html! {
-        p { "Lines are means over seeds, bands one standard deviation." }
+        p {
+            "Scores when one setting is varied and the others stay. Lines are means over seeds, bands one standard deviation. Among the \
+             settings: " (term("y", "y_max")) ", " (term("filter", "z_th")) ", " (term("lambda", "λ")) "."
+        }
         @for name in names {
             h3 { (name) }
             div class="keys" { @for (s, v) in series.iter().zip(&all) { @if v.name == name { (svg::key(s)) } } }

@@ -56,6 +56,50 @@ pub struct Method {
     pub plain: bool,
 }
 
+/// Where a run's settings come from, and how long it learned.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Recipe {
+    /// The preset that its settings are nearest to; None where they are like none.
+    pub preset: Option<String>,
+    /// Where it differs from that preset: `learner.steps = 60 (12000)`.
+    pub changed: Vec<String>,
+    /// What it learned by; None where its settings do not say.
+    pub learner: Option<Budget>,
+    /// What the same method learns by under the paper's settings.
+    pub paper: Option<Budget>,
+}
+
+impl Recipe {
+    /// Whether the settings are the paper's.
+    pub fn is_papers(&self) -> bool {
+        self.preset.as_deref() == Some("paper") && self.changed.is_empty()
+    }
+}
+
+/// A learner and how many updates it makes.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct Budget {
+    /// The learner's name.
+    pub learner: String,
+    /// Its updates.
+    pub updates: u64,
+}
+
+/// The policy that `tce run` recommended for a task, before anybody looked at scores.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Recommended {
+    /// The task.
+    pub task: Task,
+    /// The run's folder, by its name; None for a run that is not here.
+    pub folder: Option<String>,
+    /// The policy's seed.
+    pub seed: Option<u64>,
+    /// The method, as the recommendation names it.
+    pub method: String,
+    /// Whether the recommendation was sure of itself.
+    pub sure: bool,
+}
+
 /// One policy and its score.
 #[derive(Clone, Debug)]
 pub struct Run {
@@ -69,6 +113,8 @@ pub struct Run {
     pub index: usize,
     /// Its folder, which it may share with other seeds.
     pub folder: Arc<RunFolder>,
+    /// Where its settings come from.
+    pub recipe: Arc<Recipe>,
 }
 
 /// A planned or begun run without a result.
@@ -122,4 +168,6 @@ pub struct Study {
     pub costs: Vec<Cost>,
     /// What `tce diagnose` found about its runs.
     pub diagnoses: Vec<Diagnosis>,
+    /// The policies that `tce run` recommended.
+    pub recommended: Vec<Recommended>,
 }

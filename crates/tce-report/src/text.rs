@@ -1,7 +1,6 @@
 //! The report's tables as Markdown and as LaTeX.
 
-use crate::analysis::{Analysis, Cell, ShiftTable};
-use crate::html::headline;
+use crate::analysis::{Analysis, Cell, ShiftTable, opening};
 use crate::stats::Estimate;
 use crate::study::{Study, shift_title, short};
 
@@ -12,6 +11,8 @@ struct Table {
     rows: Vec<Vec<String>>,
     /// Rows that follow a rule.
     rules: Vec<usize>,
+    /// What a reader has to know of it.
+    doubt: Option<String>,
 }
 
 fn estimate(e: &Estimate, decimals: usize) -> String {
@@ -60,6 +61,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Table {
         header: std::iter::once("Task".into()).chain(ours).chain(papers).collect(),
         rules: vec![rows.len() - 1],
         rows,
+        doubt: t.doubt.clone(),
     }
 }
 
@@ -68,7 +70,7 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
     let mut header: Vec<String> =
         ["Method", "Runs", "Interquartile mean", "Mean", "Median", "Optimality gap", "Total"].map(Into::into).to_vec();
     header.extend(c.floors.iter().map(|f| format!("P(> {})", analysis.methods[*f].title)));
-    header.push("Against the best floor".into());
+    header.extend(["Points above the best baseline", "Finding"].map(Into::into));
     let rows = c.methods.iter().map(|a| {
         let [iqm, median, mean, gap] = a.over_seeds;
         let mut row = vec![title(analysis, a.method), a.runs.to_string()];
@@ -77,9 +79,10 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
             Some(over) => row.extend(over.iter().map(|e| estimate(e, 2))),
             None => row.extend(c.floors.iter().map(|_| "–".into())),
         }
+        row.push(c.gap(a).map_or("–".into(), |gap| format!("{gap:+.1}")));
         row.push(match (analysis.methods[a.method].floor, c.improvement(a)) {
-            (true, _) if c.best_floor() == Some(a.method) => "the best floor".into(),
-            (true, _) => "floor".into(),
+            (true, _) if c.best_floor() == Some(a.method) => "the best baseline".into(),
+            (true, _) => "baseline".into(),
             (false, Some((_, finding))) => finding.word().into(),
             (false, None) => "–".into(),
         });
@@ -91,6 +94,7 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
         header,
         rows: rows.collect(),
         rules: Vec::new(),
+        doubt: None,
     })
 }
 
@@ -100,8 +104,10 @@ fn tables(analysis: &Analysis) -> Vec<Table> {
 
 fn caption(study: &Study, analysis: &Analysis) -> String {
     format!(
-        "{} of {} runs have a result. Normalised scores, mean ± standard deviation over seeds; brackets: {:.0} % intervals of a bootstrap \
-         stratified by task; † with a diverged policy, counted as 0.",
+        "Preset {}{}. {} of {} runs have a result. Normalised scores (0: a random policy, 100: an expert), mean ± standard deviation \
+         over seeds; brackets: {:.0} % intervals of a bootstrap stratified by task; † with a diverged policy, counted as 0.",
+        analysis.recipes.names(),
+        analysis.recipes.updates().map_or_else(String::new, |u| format!(", {u} learner updates")),
         study.runs.len(),
         study.runs.len() + study.missing.len(),
         100.0 * analysis.level
@@ -113,7 +119,7 @@ const CASES: usize = 10;
 
 /// The report's tables, warnings and finding in Markdown.
 pub fn markdown(study: &Study, analysis: &Analysis) -> String {
-    let mut out = format!("# {}\n\n{}\n\n", md(&study.name), md(&headline(analysis)));
+    let mut out = format!("# {}\n\n{}\n\n", md(&study.name), md(&opening(analysis).join(" ")));
     for w in &analysis.warnings {
         out += &format!("> **Note.** {}\n", md(&w.text));
         for d in w.details.iter().take(CASES) {
@@ -128,7 +134,8 @@ pub fn markdown(study: &Study, analysis: &Analysis) -> String {
     for t in tables(analysis) {
         let line = |cells: &[String]| format!("| {} |\n", cells.iter().map(|c| md(c)).collect::<Vec<_>>().join(" | "));
         let rule: String = (0..t.header.len()).map(|k| if k == 0 { "|---" } else { "|---:" }).collect();
-        out += &format!("\n## {}\n\n{}{rule}|\n", t.title, line(&t.header));
+        let doubt = t.doubt.as_ref().map_or_else(String::new, |d| format!("{}\n\n", md(d)));
+        out += &format!("\n## {}\n\n{doubt}{}{rule}|\n", t.title, line(&t.header));
         out.extend(t.rows.iter().map(|r| line(r)));
     }
     out
@@ -162,8 +169,9 @@ pub fn latex(study: &Study, analysis: &Analysis) -> String {
     for t in tables(analysis) {
         let line =
             |cells: &[String]| format!("  {} \\\\\n", cells.iter().map(|c| tex(c)).collect::<Vec<_>>().join(" & "));
+        let doubt = t.doubt.as_ref().map_or_else(String::new, |d| format!(" {}", tex(d)));
         out += &format!(
-            "\n\\begin{{table}}[t]\n\\centering\n\\caption{{{}: {}. {}}}\n\\resizebox{{\\linewidth}}{{!}}{{%\n\\begin{{tabular}}{{l{}}}\n\\toprule\n",
+            "\n\\begin{{table}}[t]\n\\centering\n\\caption{{{}: {}. {}{doubt}}}\n\\resizebox{{\\linewidth}}{{!}}{{%\n\\begin{{tabular}}{{l{}}}\n\\toprule\n",
             tex(&study.name),
             tex(&t.title),
             tex(&caption(study, analysis)),
@@ -201,6 +209,7 @@ fn tex(text: &str) -> String {
             '†' => out += "\\textdagger{}",
             '−' => out += "$-$",
             '–' => out += "--",
+            '\u{a0}' => out += "~",
             '\n' | '\r' => out.push(' '),
             c => out.push(c),
         }

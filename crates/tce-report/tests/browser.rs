@@ -2,14 +2,13 @@
 //!
 //! Needs Chromium (`apt install chromium`); without it these tests are skipped, and say so.
 
+mod common;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use common::{diagnosis, hopper, one_task, quick};
 use tce_data::{Agent, Quality, Shift, Task};
-use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied,
-    ImpliedActions, ImpliedErrors, ImpliedRollout, Labels, Memorisation, Rated, Reliability, Sampled, Spread,
-};
 
 fn browser() -> Option<PathBuf> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
@@ -63,117 +62,6 @@ fn open(browser: &Path, page: &Path) -> (String, Vec<String>) {
     (String::from_utf8_lossy(&output.stdout).into_owned(), console)
 }
 
-fn spread(median: f64) -> Option<Spread> {
-    Spread::of([median * 0.5, median, median * 2.0])
-}
-
-fn reliability(y: f64) -> Reliability {
-    Reliability {
-        rows: 90,
-        distance: spread(0.1 + y),
-        transition_kl: spread(1.0 + 10.0 * y),
-        reward_difference: spread(0.01 + y),
-        reward_error: spread(0.02 + y),
-        consistency: spread(0.05 + y),
-    }
-}
-
-fn embedding(groups: &[Group]) -> Embedding {
-    let points = |k: usize| (0..50).map(|i| [(i * 7 % 13) as f32 + k as f32, (i * 5 % 11) as f32]).collect();
-    Embedding { groups: groups.iter().enumerate().map(|(k, g)| (*g, points(k))).collect() }
-}
-
-fn diagnosis(task: Option<Task>) -> Diagnosis {
-    let memorisation = Memorisation {
-        generated: spread(1.0).unwrap(),
-        held_out: spread(0.9).unwrap(),
-        identical: 0.0,
-        probability: 0.45,
-        of_copies: 0.9,
-    };
-    let at = |y: f64| AtBound {
-        y_max: y,
-        lost: 0,
-        coverage: Some(Coverage { target: 0.9 - y, source: Some(0.1 + y) }),
-        rejected: 0.1,
-        memorisation: Some(memorisation),
-        kept: reliability(y),
-        outliers: Some(reliability(2.0 * y)),
-    };
-    let generated: Vec<f64> = (0..100).map(|i| 0.2 + 0.001 * f64::from(i)).collect();
-    let sources: Vec<f64> = (0..100).map(|i| 0.5 + 0.01 * f64::from(i)).collect();
-    let curve = Curve::of(&Rated::certain(sources), &Rated::certain(generated));
-    let histogram = |n: u64| Histogram { low: 0.0, high: 0.2, counts: (0..20).map(|k| n + k % 3).collect() };
-    let implied = ImpliedErrors {
-        rows: 2000,
-        lost: 0,
-        draws: 8,
-        single: 0.25,
-        mean: 0.2,
-        between_draws: 0.15,
-        inverse: 0.03,
-        spread: 0.5,
-    };
-    Diagnosis {
-        of: "tce-og-<b>".into(),
-        task,
-        seed: 3,
-        y_max: 0.2,
-        z_threshold: Some(3.0),
-        lambda: 0.0,
-        rows: 100,
-        target_rows: 5000,
-        coverage_rows: 45,
-        covered_by_target: Some(Coverage { target: 0.96, source: Some(0.05) }),
-        covered_by_fresh: true,
-        bounds_of_y: [0.0, 0.1, 0.2].map(at).into(),
-        sampled: Sampled {
-            y_kept: histogram(5),
-            y_rejected: histogram(1),
-            z: histogram(4),
-            z_real: histogram(3),
-            real_rejected: 0.07,
-        },
-        transitions: Some(embedding(&[Group::Source, Group::NearestSource, Group::Target, Group::Generated])),
-        states: vec![(0.2, embedding(&[Group::Source, Group::Target, Group::Generated]))],
-        labels: Labels {
-            held_out_action: Some((0.01, 0.5)),
-            held_out_reward: Some((0.02, 0.6)),
-            at_source: Some((0.2, 0.3)),
-            at_generated: Some((0.1, 0.2)),
-            terminal: Some(0.01),
-        },
-        implied: Some(Implied {
-            actions: ImpliedActions { trained: Some(implied), held_out: Some(implied) },
-            rollout: Some(ImpliedRollout {
-                episodes: 10,
-                score: Some((61.0, 4.0)),
-                returns: Some((1000.0, 50.0)),
-                length: Some(900.0),
-                failed: None,
-            }),
-            behaviour_score: Some(90.0),
-        }),
-        error_over_distance: ErrorOverDistance::of(
-            (1..=100).map(|i| (0.01 * f64::from(i), 0.02 * f64::from(i))).collect(),
-            Some(0.3),
-            true,
-        ),
-        choice: curve.as_ref().map(Choice::of),
-        choice_by_simulator: curve.as_ref().map(Choice::of),
-        theorem: Some(Bounds {
-            discount: 0.99,
-            r_max: 5.0,
-            transition: curve.clone(),
-            value: curve.clone(),
-            transition_alone: curve.clone(),
-            value_alone: curve,
-            held_out: Some((0.1, 0.05)),
-        }),
-        notes: vec!["a <note>".into()],
-    }
-}
-
 #[test]
 fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
     let page = tce_report::diagnosis_page(&diagnosis(Some(Task {
@@ -197,7 +85,9 @@ fn a_diagnosis_opens_without_a_word_and_with_all_its_figures() {
     // Coverage, copies, five of reliability, errors over distance, two pictures, two histograms, two bounds.
     assert_eq!(figures.len(), 14);
     for figure in figures {
-        assert!(drawn(figure) >= 2, "{figure}");
+        // Errors over distance are one line; all others compare two things at least.
+        let least = if figure.contains("Label error against distance") { 1 } else { 2 };
+        assert!(drawn(figure) >= least, "{figure}");
     }
     for expected in ["λ = 0", "no copies", "tce-og-&lt;b&gt;", "a &lt;note&gt;"] {
         assert!(document.contains(expected), "{expected}");
@@ -215,4 +105,50 @@ fn a_broken_promise_shows_on_the_console() {
     std::fs::write(&path, page).unwrap();
     let (_, console) = open(&browser, &path);
     assert!(console.iter().any(|l| l.contains("Content Security Policy")), "{console:?}");
+}
+
+/// The page's width and its window's, in windows of 1280 and 390 pixels. The pages themselves run no script: one around them looks in.
+fn widths(browser: &Path, page: &str) -> Vec<(u32, u32)> {
+    let source = page.replace('&', "&amp;").replace('"', "&quot;");
+    let frame = |width: u32| {
+        format!("<iframe width=\"{width}\" height=\"2000\" style=\"border:0\" srcdoc=\"{source}\"></iframe>")
+    };
+    let script = "addEventListener('load', () => { document.title = 'widths ' + [...document.querySelectorAll('iframe')].map(f => \
+                  f.contentDocument.documentElement.scrollWidth + ' ' + f.contentWindow.innerWidth).join(' '); });";
+    let around =
+        format!("<!DOCTYPE html><meta charset=\"utf-8\"><script>{script}</script>{}{}", frame(1280), frame(390));
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("around.html");
+    std::fs::write(&path, around).unwrap();
+    let (document, _) = open(browser, &path);
+    let title =
+        document.split("<title>widths ").nth(1).and_then(|t| t.split("</title>").next()).expect("the script ran");
+    let numbers: Vec<u32> = title.split(' ').map(|n| n.parse().unwrap()).collect();
+    numbers.chunks(2).map(|n| (n[0], n[1])).collect()
+}
+
+#[test]
+fn pages_fit_a_screen_and_a_phone() {
+    let Some(browser) = browser() else { return };
+    let root = tempfile::tempdir().unwrap();
+    let mut study = one_task(
+        root.path(),
+        &[
+            ("bc-raw", "BC, raw observations", &[1.0, 2.0]),
+            ("bc-ensemble", "BC, ensemble of 5", &[95.0, 95.5]),
+            ("tce-og", "TCE(OG), a_setting_with_quite_a_long_name=0.123456789", &[0.4, 0.5]),
+            ("igdf", "IGDF", &[20.0, 30.0]),
+        ],
+    );
+    study.diagnoses.push(diagnosis(Some(hopper())));
+    let analysis = tce_report::analyse(&study, &quick()).unwrap();
+    let report = tce_report::html::page(&study, &analysis);
+    for page in [&report, &tce_report::diagnosis_page(&diagnosis(Some(hopper())))] {
+        let found = widths(&browser, page);
+        assert_eq!(found.iter().map(|w| w.1).collect::<Vec<_>>(), [1280, 390]);
+        assert!(found.iter().all(|(page, window)| page <= window), "{found:?}");
+        // A page that is too wide is told on.
+        let wide = page.replace("</main>", "<div style=\"width: 2000px\">wide</div></main>");
+        assert!(widths(&browser, &wide).iter().all(|(page, window)| page > window));
+    }
 }

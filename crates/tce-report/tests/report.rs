@@ -1,61 +1,18 @@
 //! The whole way from run folders to the page, on folders made up here.
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use std::sync::Arc;
 
+use common::{HOSTILE, add, method, quick, write_folder};
 use serde_json::{Value, json};
-use tce_base::sha256_hex;
 use tce_data::{Agent, Quality, Shift, Task};
-use tce_report::{Analysis, Cost, Method, Missing, Options, Run, RunFolder, Study, analyse};
-
-const HOSTILE: &str = "<script>alert(1)</script>\"'&{}|%_$\\";
+use tce_report::{Analysis, Cost, Missing, Run, RunFolder, Study, analyse};
 
 fn task(agent: Agent, target: Quality) -> Task {
     Task { agent, shift: Shift::Morph, source: Quality::Medium, target }
-}
-
-/// A run's folder with one member per score; a score that is None is a policy that diverged.
-fn write_folder(directory: &Path, scores: &[(u64, Option<f64>)], config: &str) {
-    fs::create_dir_all(directory).unwrap();
-    let write = |name: &str, text: &str| fs::write(directory.join(name), text).unwrap();
-    write("config.toml", config);
-    let inputs = json!({ "agent": "hopper", "shift": "morph", "target": "00ff", "source": null });
-    write("spec.json", &json!({ "format": 2, "stage": "x", "spec": { "inputs": inputs } }).to_string());
-    let evaluation = |score: &Option<f64>| match score {
-        Some(s) => json!({ "returns": [s * 10.0, s * 12.0], "lengths": [9, 9], "score": s }),
-        None => json!({ "returns": [], "lengths": [], "score": null, "failed": HOSTILE }),
-    };
-    let summary = json!({
-        "name": "x",
-        "seeds": scores.iter().map(|s| s.0).collect::<Vec<_>>(),
-        "scores": scores.iter().map(|s| s.1).collect::<Vec<_>>(),
-        "learned": { "evaluations": scores.iter().map(|s| evaluation(&s.1)).collect::<Vec<_>>(), "seconds": 61.0 },
-        "extra_rows": 1234,
-        "generated": [],
-        "seconds": 125.0,
-        "directory": "x",
-    });
-    let files = json!({ "config.toml": sha256_hex(config.as_bytes()) });
-    write("done.json", &json!({ "program": "tce 0.1.0", "files": files, "summary": summary }).to_string());
-    let mut lines = String::new();
-    for (member, (_, score)) in scores.iter().enumerate() {
-        for step in [100, 200, 300] {
-            let loss = 1.0 / f64::from(step);
-            lines += &format!("{}\n", json!({ "stage": "learn", "step": step, "member": member, "policy_loss": loss }));
-            if let Some(s) = score {
-                let line = json!({ "stage": "evaluate", "step": step, "member": member, "score": s * f64::from(step) / 300.0 });
-                lines += &format!("{line}\n");
-            }
-        }
-    }
-    // A killed program leaves half a line.
-    write("metrics.jsonl", &(lines + "{\"stage\":\"le"));
-}
-
-fn method(id: &str, title: &str, floor: bool) -> Method {
-    Method { id: id.into(), title: title.into(), variant: id.into(), floor, plain: true }
 }
 
 /// Two tasks, four floors, TCE(OG) and a method with a hostile name.
@@ -78,6 +35,7 @@ fn study(root: &Path) -> Study {
         conflicts: Vec::new(),
         notes: Vec::new(),
         diagnoses: Vec::new(),
+        recommended: Vec::new(),
         costs: vec![Cost {
             stage: "Score networks".into(),
             agent: Agent::Hopper,
@@ -97,19 +55,6 @@ fn study(root: &Path) -> Study {
         }
     }
     study
-}
-
-fn add(study: &mut Study, task: Task, method: &str, directory: &Path) {
-    let folder = Arc::new(RunFolder::read(directory).unwrap().unwrap());
-    assert_eq!(folder.damage(), None);
-    for (index, member) in folder.members.iter().enumerate() {
-        let member = member.clone();
-        study.runs.push(Run { task, method: method.into(), member, index, folder: folder.clone() });
-    }
-}
-
-fn quick() -> Options {
-    Options { resamples: 200, ..Options::default() }
 }
 
 fn page(study: &Study) -> (Analysis, String) {
@@ -199,7 +144,7 @@ fn the_page_has_the_numbers_the_floors_and_the_paper() {
     assert_eq!(c.best_floor(), Some(3));
     let og = c.methods.iter().find(|a| analysis.methods[a.method].id == "tce-og").unwrap();
     assert_eq!(c.improvement(og).unwrap().0.point, 1.0);
-    assert!(page.contains("All 2 methods beat the best floor, Target Only."));
+    assert!(page.contains("Of two methods compared with Target Only, two are shown to beat it"));
     assert!(analysis.warnings.is_empty(), "{:?}", analysis.warnings);
     for (text, name) in [
         (tce_report::text::markdown(&study, &analysis), "markdown"),
@@ -268,10 +213,10 @@ fn whatever_is_wrong_is_said_first() {
         "Published mode: TCE(OG) follow",
         "Few seeds: 2 to 5",
         "Unequal numbers of seeds, 2 to 5",
-        "Floors are missing: BC, standardised on 1 of 2",
-        "Aggregates are over the 1 of 2 tasks",
+        "Baselines are missing: BC, standardised on 1 of 2",
+        "Means over tasks are of the 1 of 2 tasks",
         // Two runs below five: chance does that in 2 of 21 cases.
-        "Not shown to beat the best floor (Target Only): TCE(OG)",
+        "Not proved to differ from the best baseline, Target Only: TCE(OG) (",
     ] {
         assert!(warned(&analysis, text), "{text}: {:#?}", analysis.warnings);
     }
@@ -322,7 +267,7 @@ fn methods_without_a_common_task_are_left_out_by_name() {
     let c = analysis.comparison.as_ref().unwrap();
     assert_eq!(c.left_out, [5]);
     assert_eq!(c.tasks, [task(Agent::Hopper, Quality::Expert)]);
-    assert!(warned(&analysis, "Not in the aggregates"));
+    assert!(warned(&analysis, "Left out of the means over tasks"));
 }
 
 /// A method that has just begun does not take the others' tasks away.
@@ -344,7 +289,7 @@ fn a_beginning_does_not_shrink_the_comparison() {
     let (analysis, _) = page(&study);
     let c = analysis.comparison.as_ref().unwrap();
     assert_eq!((c.left_out.as_slice(), c.tasks.len()), ([5].as_slice(), 6));
-    assert!(warned(&analysis, "Not in the aggregates, for lack of scores on more than half of the tasks"));
+    assert!(warned(&analysis, "Left out of the means over tasks, for lack of scores on more than half of the tasks"));
 }
 
 #[test]
@@ -353,8 +298,8 @@ fn one_seed_has_no_interval_and_no_finding() {
     let mut study = study(root.path());
     study.runs.retain(|r| r.member.seed == 0);
     let (analysis, page) = page(&study);
-    assert!(warned(&analysis, "Few seeds: 1 a task"));
-    assert!(page.contains("one seed: cannot be told") && page.contains("None of the 2 methods is shown to beat"));
+    assert!(warned(&analysis, "Few seeds: 1 for each task"));
+    assert!(page.contains(">one seed<") && page.contains("two are not proved to differ from it"));
 }
 
 /// Two seeds of one task, all above: the interval is a point, and still nothing is shown.
@@ -368,7 +313,7 @@ fn two_seeds_of_one_task_show_nothing() {
     let og = c.methods.iter().find(|a| analysis.methods[a.method].id == "tce-og").unwrap();
     assert_eq!(c.improvement(og).unwrap().0.interval, Some((1.0, 1.0)));
     assert!(og.p_value.unwrap() > 0.2, "{:?}", og.p_value);
-    assert!(page.contains("too few runs to tell") && warned(&analysis, "Not shown to beat the best floor"));
+    assert!(page.contains(">too few runs<") && warned(&analysis, "Not proved to differ from the best baseline"));
 }
 
 #[test]

@@ -11,11 +11,12 @@ use tce_base::FileError;
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
 use tce_report::folder::Verdict;
-use tce_report::{Cost, Method, Missing, ReportError, Run, RunFolder, Study};
+use tce_report::{Cost, Method, Missing, Recipe, Recommended, ReportError, Run, RunFolder, Study};
 
 use crate::config::Config;
 use crate::diagnosis;
 use crate::error::{Error, Result};
+use crate::recipe::Recipes;
 use crate::sweep::gather::Checked;
 use crate::sweep::{Entry, Kind, Sweep};
 use crate::variant::Variant;
@@ -62,6 +63,8 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     }
     let mut notes = Vec::new();
     let diagnoses = diagnoses(&sweep.directory.join("runs"), &mut notes);
+    let recommended = recommended(&sweep.directory.join("runs"), &mut notes);
+    let mut recipes = Recipes::default();
     let mut study = Study {
         name: sweep.manifest.header.name.clone(),
         sweep: true,
@@ -73,6 +76,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
         notes,
         costs: Vec::new(),
         diagnoses,
+        recommended,
     };
     for entry in runs() {
         let mut missing = |why: String| {
@@ -97,7 +101,9 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
                             seeds: folder.members.len(),
                             memory: outcome.memory,
                         });
-                        add_runs(&mut study.runs, entry.task, &entry.column(), folder);
+                        let variant = entry.variant.map(Variant::name).unwrap_or_default();
+                        let recipe = recipes.of(entry.task, &variant, &folder);
+                        add_runs(&mut study.runs, entry.task, &entry.column(), folder, &recipe);
                     }
                 }
             }
@@ -166,10 +172,17 @@ fn agree(sweep: &Sweep, entry: &Entry, recorded: Option<f64>, folder: &RunFolder
     .into())
 }
 
-fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder) {
+fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder, recipe: &Arc<Recipe>) {
     let folder = Arc::new(folder);
     for (index, member) in folder.members.iter().enumerate() {
-        runs.push(Run { task: of, method: method.to_owned(), member: member.clone(), index, folder: folder.clone() });
+        runs.push(Run {
+            task: of,
+            method: method.to_owned(),
+            member: member.clone(),
+            index,
+            folder: folder.clone(),
+            recipe: recipe.clone(),
+        });
     }
 }
 
@@ -239,7 +252,8 @@ fn of_runs(directory: &Path) -> Result<Study> {
     let methods = in_order(methods);
     let mut costs: Vec<Cost> = networks(directory).into_values().collect();
     let mut runs = Vec::new();
-    for ((of, _, folder), id) in finished.into_iter().zip(ids) {
+    let mut recipes = Recipes::default();
+    for ((of, name, folder), id) in finished.into_iter().zip(ids) {
         costs.push(Cost {
             stage: learning(&method_title(&methods, &id)),
             agent: of.agent,
@@ -247,10 +261,12 @@ fn of_runs(directory: &Path) -> Result<Study> {
             seeds: folder.members.len(),
             memory: None,
         });
-        add_runs(&mut runs, of, &id, folder);
+        let recipe = recipes.of(of, &name, &folder);
+        add_runs(&mut runs, of, &id, folder, &recipe);
     }
     let name = directory.canonicalize().map_or_else(|_| name_of(directory), |d| name_of(&d));
     let diagnoses = diagnoses(directory, &mut notes);
+    let recommended = recommended(directory, &mut notes);
     Ok(Study {
         name,
         sweep: false,
@@ -262,6 +278,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         notes,
         costs,
         diagnoses,
+        recommended,
     })
 }
 
@@ -326,6 +343,33 @@ fn diagnoses(root: &Path, notes: &mut Vec<String>) -> Vec<Diagnosis> {
         found.map_err(|e| notes.push(format!("A diagnosis is left out. {e}"))).ok()
     };
     finished.filter_map(read).collect()
+}
+
+/// What `tce run` recommended for the tasks under `root`.
+fn recommended(root: &Path, notes: &mut Vec<String>) -> Vec<Recommended> {
+    let mut out = Vec::new();
+    for place in directories(root).unwrap_or_default() {
+        let (Some(task), path) = (task_of(&place), place.join("verdict.json")) else { continue };
+        if !path.exists() {
+            continue;
+        }
+        let verdict = json(&path).unwrap_or_default();
+        let (Some(method), Some(policy)) = (verdict["method"].as_str(), verdict["policy"].as_str()) else {
+            notes.push(format!("A recommendation is left out: {} names no method and policy.", path.display()));
+            continue;
+        };
+        // RUN/policy-seedN.safetensors
+        let policy = Path::new(policy);
+        let seed = policy.file_stem().and_then(|n| n.to_str()?.strip_prefix("policy-seed")?.parse().ok());
+        out.push(Recommended {
+            task,
+            folder: policy.parent().map(name_of),
+            seed,
+            method: method.to_owned(),
+            sure: verdict["sure"].as_bool().unwrap_or(false),
+        });
+    }
+    out
 }
 
 /// The networks that the rows of a stage were generated by.

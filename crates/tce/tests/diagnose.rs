@@ -83,6 +83,16 @@ fn a_run_is_measured_and_its_report_shows_it() {
     assert!(bins.len() == 10 && bins.iter().all(|b| b["error"]["median"].as_f64().unwrap() > 0.0), "{bins:?}");
     assert_eq!(found["error_over_distance"]["simulated"], true);
 
+    // The terminal says first what to do, in lines of 80 columns but for the files' names.
+    let args = diagnose(&og, &[]);
+    let said = tce(dir.path(), &args.iter().map(String::as_str).collect::<Vec<_>>());
+    let said = String::from_utf8_lossy(&said.stdout).into_owned();
+    let first = said.lines().next().unwrap();
+    assert!(first.contains("se these rows, because") || first.starts_with("The data do not tell"), "{said}");
+    for line in said.lines().filter(|l| !l.contains("/stages/") && !l.contains(", seed ")) {
+        assert!(line.chars().count() <= 80, "{line}");
+    }
+
     // The same bytes with two threads, elsewhere; and at once where it is done.
     let bytes = file(dir.path(), &found, "diagnosis.json");
     let elsewhere = json(&diagnose(&og, &["--threads", "2", "--out", "elsewhere"]));

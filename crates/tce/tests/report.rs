@@ -58,6 +58,13 @@ fn fill(sweep: &Path, manifest: &[Value]) -> Vec<PathBuf> {
     records
 }
 
+/// No line is wider than a terminal, but for the files' names.
+fn fits(text: &str) {
+    for line in text.lines().filter(|l| !l.contains("report.")) {
+        assert!(line.chars().count() <= 80, "{} columns: {line}", line.chars().count());
+    }
+}
+
 #[test]
 fn a_sweep_becomes_a_page() {
     let dir = tempfile::tempdir().unwrap();
@@ -74,8 +81,16 @@ fn a_sweep_becomes_a_page() {
     assert_eq!(report["comparison"]["tasks"].as_array().unwrap().len(), 3);
     let warnings = report["warnings"].to_string();
     assert!(warnings.contains("Few seeds: 2") && !warnings.contains("Partial"), "{warnings}");
+    // The override is a change of the preset, and the paper's figures are doubted where they stand.
+    assert_eq!(report["recipes"]["presets"], json!({ "quick with changes": 36 }));
+    assert!(report["recipes"]["updates"][1].as_u64() > Some(0));
+    let doubt = report["tables"][0]["doubt"].as_str().unwrap();
+    assert!(
+        doubt.contains("preset quick with changes") && doubt.contains("in the paper: 1\u{a0}000\u{a0}000"),
+        "{doubt}"
+    );
     let page = fs::read_to_string(sweep.join("report.html")).unwrap();
-    for text in ["TCE(OG), &lt;b&gt;&amp;y", "beats the best floor", "62.0", "1.0 GiB", "Table 1", "y_max = 0.1"] {
+    for text in ["TCE(OG), &lt;b&gt;&amp;y", "shown to beat it", "62.0", "1.0 GiB", "Table 1", "y_max = 0.1"] {
         assert!(page.contains(text), "{text}");
     }
     assert!(!page.contains("<b>&y") && !page.contains("http:") && !page.contains("https:"));
@@ -90,6 +105,7 @@ fn a_sweep_becomes_a_page() {
     assert!(partial.status.success());
     let text = String::from_utf8_lossy(&partial.stdout).into_owned();
     assert!(text.contains("warning: Partial results: 2 of 36 runs"), "{text}");
+    fits(&text);
     let page = fs::read_to_string(sweep.join("report.html")).unwrap();
     assert!(page.contains("Partial results: 2 of 36") && page.contains("corrupt: ") && page.contains("not done"));
     fs::write(&changed, whole).unwrap();
@@ -134,7 +150,16 @@ fn a_folder_of_runs_becomes_a_page() {
     );
     fs::create_dir_all(place.join("tce-nn-bbbbbbbbbbbb")).unwrap();
     fs::write(place.join("tce-nn-bbbbbbbbbbbb/spec.json"), "{}").unwrap();
+    // The clones' second policy was recommended; the best policy scores 99, so that its regret is 8.
+    let verdict = json!({ "method": "BC", "policy": "bc-0123456789ab/policy-seed1.safetensors", "sure": true });
+    fs::write(place.join("verdict.json"), verdict.to_string()).unwrap();
     let report = tce_json(dir.path(), &["report", "runs", "--resamples", "200", "--out", "elsewhere"]);
+    let recommended = &report["recommendations"][0];
+    assert_eq!((&recommended["score"], &recommended["best"]["score"]), (&json!(91.0), &json!(99.0)), "{recommended}");
+    let text = tce(dir.path(), &["report", "runs", "--resamples", "200", "--out", "elsewhere"]);
+    let text = String::from_utf8_lossy(&text.stdout).into_owned();
+    fits(&text);
+    assert!(text.replace("\n", " ").contains("a regret of 8.0 points"), "{text}");
     assert_eq!(report["files"][0], "elsewhere/report.html");
     let methods: Vec<&str> = report["methods"].as_array().unwrap().iter().map(|m| m["id"].as_str().unwrap()).collect();
     assert_eq!(methods[..4], ["bc-raw", "bc", "bc-top", "target-only"]);
@@ -144,10 +169,14 @@ fn a_folder_of_runs_becomes_a_page() {
         "Partial results: 1 of 31",
         "several runs of one seed",
         "Published mode",
-        "Below the best floor (BC, best half)",
+        "Shown to fall short of the best baseline, BC, best half",
     ] {
         assert!(warnings.contains(text), "{text}: {warnings}");
     }
     let page = fs::read_to_string(dir.path().join("elsewhere/report.html")).unwrap();
-    assert!(page.contains("1 of 2 methods beats the best floor") && page.contains("97.0") && page.contains("99.8"));
+    assert!(
+        page.contains("Of two methods compared with BC, best half, one is shown to beat it")
+            && page.contains("97.0")
+            && page.contains("99.8")
+    );
 }

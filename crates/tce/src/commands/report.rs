@@ -4,9 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_report::analysis::{Aggregate, Comparison, opening};
 use tce_report::{Analysis, Options, analyse};
 
 use crate::error::{Error, Result};
+use crate::narrow::wrapped;
 use crate::output::{Output, table};
 use crate::study::of_directory;
 
@@ -49,30 +51,103 @@ impl Report {
 
 fn render(written: &Written) -> String {
     let Written { files, analysis } = written;
-    let mut text = String::new();
+    let mut text = wrapped(&opening(analysis).join(" "), 0) + "\n\n";
     if let Some(c) = &analysis.comparison {
-        let rows = c.methods.iter().map(|a| {
-            let [iqm, ..] = a.over_seeds;
-            let range = |i: Option<(f64, f64)>, d: usize| i.map_or("-".into(), |(l, h)| format!("{l:.d$} to {h:.d$}"));
-            let improvement = c.improvement(a);
-            [
-                analysis.methods[a.method].title.clone(),
-                a.runs.to_string(),
-                format!("{:.1}", iqm.point),
-                range(iqm.interval, 1),
-                improvement.map_or("-".into(), |(p, _)| format!("{:.2}", p.point)),
-                improvement.map_or("-".into(), |(p, _)| range(p.interval, 2)),
-                improvement.map_or("floor".into(), |(_, finding)| finding.word().into()),
-            ]
-        });
-        let header = ["method", "runs", "IQM", "95 %", "P(> best floor)", "95 %", "finding"];
-        text += &format!("{} tasks\n{}\n", c.tasks.len(), table(&header, rows));
+        text += &comparison(analysis, c);
+    }
+    let updates = analysis.recipes.updates().map_or_else(String::new, |u| format!(", {u} learner updates"));
+    text += &wrapped(&format!("preset {}{updates}", analysis.recipes.names()), 2);
+    text.push('\n');
+    for doubt in analysis.tables.iter().filter_map(|t| t.doubt.as_ref()) {
+        text += &wrapped(&format!("warning: {doubt}"), 2);
+        text.push('\n');
     }
     for warning in &analysis.warnings {
-        text += &format!("warning: {}\n", warning.text);
+        text += &wrapped(&format!("warning: {}", warning.text), 2);
+        text.push('\n');
     }
     for file in files {
         text += &format!("{}\n", file.display());
     }
     text
+}
+
+/// Scores of all methods, and how the others lie beside the best baseline: two tables, so that a line has 80 columns.
+fn comparison(analysis: &Analysis, c: &Comparison) -> String {
+    let range = |i: Option<(f64, f64)>, d: usize| i.map_or("-".into(), |(l, h)| format!("{l:.d$} to {h:.d$}"));
+    let title = |a: &Aggregate| lines(&analysis.methods[a.method].title, TITLE);
+    let scores = c.methods.iter().map(|a| {
+        let [iqm, _, mean, _] = a.over_seeds;
+        let (least, most) = a.seeds;
+        [
+            title(a),
+            if least == most { least.to_string() } else { format!("{least} to {most}") },
+            format!("{:.1}", mean.point),
+            format!("{:.1}", iqm.point),
+            range(iqm.interval, 1),
+            if analysis.methods[a.method].floor { "baseline".into() } else { "method".into() },
+        ]
+    });
+    let interval = format!("{:.0} % interval", 100.0 * c.level);
+    let header = ["method", "seeds", "mean", "IQM", &interval, "kind"];
+    let tasks = if c.tasks.len() == 1 { "1 task".to_owned() } else { format!("{} tasks", c.tasks.len()) };
+    let scores = table(&header, scores);
+    let mut text = format!(
+        "{}\n{scores}\n",
+        wrapped(
+            &format!(
+                "Normalised scores over {tasks} (0: a random policy, 100: an expert). IQM: interquartile mean, the mean of the middle half of \
+                 the runs."
+            ),
+            0
+        )
+    );
+    if let Some(floor) = c.standard() {
+        let rows: Vec<_> = c
+            .methods
+            .iter()
+            .filter_map(|a| {
+                let (p, finding) = c.improvement(a)?;
+                Some([
+                    title(a),
+                    format!("{:+.1}", c.gap(a)?),
+                    format!("{:.2}", p.point),
+                    range(p.interval, 2),
+                    a.p_value.map_or("-".into(), |p| format!("{p:.3}")),
+                    finding.word().to_owned(),
+                ])
+            })
+            .collect();
+        if !rows.is_empty() {
+            let header = ["method", "points", "P(higher)", &interval, "p", "finding"];
+            text += &format!(
+                "{}\n{}\n",
+                wrapped(
+                    &format!(
+                        "Against the best baseline, {}. points: above it. P(higher): share of pairs of runs in which the method's is \
+                         higher, 0.5 is no difference. p: how often chance alone does that.",
+                        analysis.methods[floor.method].title
+                    ),
+                    0
+                ),
+                table(&header, rows)
+            );
+        }
+    }
+    text
+}
+
+/// The most columns of a method's name.
+const TITLE: usize = 24;
+
+/// `text` in lines of at most `most` characters, broken at spaces where there are any.
+fn lines(text: &str, most: usize) -> String {
+    let mut out: Vec<String> = Vec::new();
+    for word in text.split(' ') {
+        match out.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= most => *line += &format!(" {word}"),
+            _ => out.push(word.to_owned()),
+        }
+    }
+    out.join("\n")
 }

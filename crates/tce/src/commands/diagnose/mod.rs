@@ -6,7 +6,7 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::{FileError, read_if_there, write_atomically};
 use tce_data::Task;
-use tce_diagnosis::{AtBound, Diagnosis, Spread};
+use tce_diagnosis::Diagnosis;
 use tce_learn::TransitionConfig;
 use tce_nn::Device;
 
@@ -15,12 +15,13 @@ use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
 use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, Inputs};
 use crate::layers::ConfigArgs;
-use crate::output::{Output, table};
+use crate::output::Output;
 use crate::own::Own;
 use crate::study::task_of;
 use crate::variant::Variant;
 
 mod generator;
+mod render;
 
 use generator::GeneratorArgs;
 
@@ -257,7 +258,7 @@ impl RunArgs {
         let page = place.join("diagnosis.html");
         write_atomically(&page, tce_report::diagnosis_page(&diagnosis).as_bytes())?;
         let files = vec![place.join("diagnosis.json"), page];
-        output.print(&Written { files, diagnosis }, render_run);
+        output.print(&Written { files, diagnosis }, |w| render::render(&w.diagnosis, &w.files));
         Ok(())
     }
 }
@@ -267,69 +268,4 @@ struct Written {
     files: Vec<PathBuf>,
     #[serde(flatten)]
     diagnosis: Diagnosis,
-}
-
-fn render_run(written: &Written) -> String {
-    let d = &written.diagnosis;
-    let figure = |s: Option<Spread>| s.map_or("-".into(), |s| format!("{:.3}", s.median));
-    let share = |s: Option<f64>| s.map_or("-".into(), |s| format!("{s:.2}"));
-    let both = |b: &AtBound, f: &dyn Fn(&tce_diagnosis::Reliability) -> Option<Spread>| {
-        format!("{} / {}", figure(f(&b.kept)), figure(b.outliers.as_ref().and_then(f)))
-    };
-    let lines = d.bounds_of_y.iter().map(|b| {
-        [
-            format!("{}", b.y_max),
-            share(b.coverage.map(|c| c.target)),
-            share(b.coverage.and_then(|c| c.source)),
-            format!("{:.1} %", 100.0 * b.rejected),
-            both(b, &|r| r.distance),
-            both(b, &|r| r.transition_kl),
-            both(b, &|r| r.reward_difference),
-            both(b, &|r| r.reward_error),
-            both(b, &|r| r.consistency),
-        ]
-    });
-    let header = [
-        "y_max",
-        "target covered",
-        "source covered",
-        "rejected",
-        "distance",
-        "KL / dim",
-        "ΔR",
-        "reward error",
-        "consistency",
-    ];
-    let mut text = format!("{}, seed {}: medians of kept / rejected rows\n{}\n", d.of, d.seed, table(&header, lines));
-    if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
-        text += &format!(
-            "copies: a generated row is nearer to a training row than a held-out row with probability {:.2} (copies: {:.2}); {}\n",
-            m.probability, m.of_copies, m
-        );
-    }
-    if let Some(implied) = &d.implied {
-        text += &format!("implied policy: {}\n", implied.sentence());
-    }
-    if let Some((first, last)) = d.error_over_distance.as_ref().and_then(|e| e.bins.first().zip(e.bins.last())) {
-        text += &format!(
-            "label error against distance: {:.3} steps at {:.1} times the usual distance between target states, {:.3} at {:.1} times (medians)\n",
-            first.error.median, first.distance, last.error.median, last.distance
-        );
-    }
-    if let Some(c) = &d.choice {
-        text += &format!(
-            "λ from the data alone: {c}; least discrepancy of values {:.4} at λ = {}, with generated rows alone {:.4}\n",
-            c.least_bound, c.least, c.generated_alone
-        );
-    }
-    if let Some(c) = &d.choice_by_simulator {
-        text += &format!("λ by the simulator: {c}\n");
-    }
-    for note in &d.notes {
-        text += &format!("note: {note}\n");
-    }
-    for file in &written.files {
-        text += &format!("{}\n", file.display());
-    }
-    text
 }

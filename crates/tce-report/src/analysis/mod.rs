@@ -1,7 +1,5 @@
 //! From runs to the figures of the report. Everything that is printed, drawn or warned about is decided here.
 
-use std::collections::{BTreeMap, BTreeSet};
-
 use serde::Serialize;
 use tce_base::Streams;
 use tce_data::{Shift, Task};
@@ -9,8 +7,18 @@ use tce_data::{Shift, Task};
 use crate::error::{ReportError, Result};
 use crate::folder::Verdict;
 use crate::paper::{self, PaperTable, Printed};
-use crate::stats::{Bootstrap, Draw, Estimate, Scores, permutation_p, probability_of_improvement};
+use crate::stats::{Bootstrap, Draw, Estimate, Scores};
 use crate::study::{Method, Run, Study, order};
+
+mod compare;
+mod opening;
+mod recipes;
+mod recommended;
+mod warnings;
+
+pub use opening::{gap_words, opening, verdict_words};
+pub use recipes::{Recipes, thousands};
+pub use recommended::Recommendation;
 
 /// A diverged policy counts as much as a random one. Left out, it would flatter its method.
 pub const DIVERGED: f64 = 0.0;
@@ -103,6 +111,8 @@ pub struct ShiftTable {
     pub paper_totals: Vec<(f64, usize)>,
     /// Ours beside the paper's.
     pub against: Vec<Against>,
+    /// Why ours and the paper's may not be comparable; None where nothing speaks against it.
+    pub doubt: Option<String>,
 }
 
 /// Statistics of one method over the compared tasks.
@@ -112,6 +122,8 @@ pub struct Aggregate {
     pub method: usize,
     /// Runs.
     pub runs: usize,
+    /// Fewest and most seeds of a task.
+    pub seeds: (usize, usize),
     /// Interquartile mean, median, mean, optimality gap, with intervals over seeds.
     pub over_seeds: [Estimate; 4],
     /// The same with intervals over tasks and seeds.
@@ -159,7 +171,7 @@ pub enum Finding {
     Open,
     /// The interval lies on one side of one half, but with so few runs chance alone often does that.
     Few,
-    /// There is no interval.
+    /// There is one seed, and so no interval.
     Unknown,
 }
 
@@ -168,10 +180,10 @@ impl Finding {
     pub fn word(self) -> &'static str {
         match self {
             Finding::Better => "beats it",
-            Finding::Worse => "falls short of it",
-            Finding::Open => "no difference shown",
-            Finding::Few => "too few runs to tell",
-            Finding::Unknown => "one seed: cannot be told",
+            Finding::Worse => "falls short",
+            Finding::Open => "not proved",
+            Finding::Few => "too few runs",
+            Finding::Unknown => "one seed",
         }
     }
 }
@@ -198,6 +210,10 @@ pub struct Analysis {
     pub tables: Vec<ShiftTable>,
     /// Methods beside each other; None without a score.
     pub comparison: Option<Comparison>,
+    /// Presets and learner updates of the runs.
+    pub recipes: Recipes,
+    /// What the recommended policies came to.
+    pub recommendations: Vec<Recommendation>,
     /// What a reader must know.
     pub warnings: Vec<Warning>,
     /// The intervals' coverage.
@@ -241,6 +257,17 @@ impl Comparison {
     pub fn best_floor(&self) -> Option<usize> {
         self.best_floor.map(|k| self.floors[k])
     }
+
+    /// The best floor's figures.
+    pub fn standard(&self) -> Option<&Aggregate> {
+        self.best_floor().and_then(|m| self.methods.iter().find(|a| a.method == m))
+    }
+
+    /// Points by which the interquartile mean of `aggregate` is above that of the best floor; None for floors.
+    pub fn gap(&self, aggregate: &Aggregate) -> Option<f64> {
+        aggregate.over_floors.as_ref()?;
+        Some(aggregate.over_seeds[0].point - self.standard()?.over_seeds[0].point)
+    }
 }
 
 /// The figures of `study`.
@@ -282,19 +309,21 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
             tables.push(shift_table(study, &bootstrap, shift, &places, &tasks, &by_task, &scores)?);
         }
     }
-    let comparison = compare(study, &bootstrap, &tasks, &scores)?;
+    let comparison = compare::compare(study, &bootstrap, &tasks, &scores)?;
     let published: Vec<bool> = study
         .methods
         .iter()
         .map(|m| m.variant.ends_with("-published") || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
         .collect();
-    let warnings = warnings(study, &tasks, &scores, comparison.as_ref(), &published);
+    let warnings = warnings::warnings(study, &tasks, &scores, comparison.as_ref(), &published);
     Ok(Analysis {
         name: study.name.clone(),
         methods: study.methods.clone(),
         published,
         tables,
         comparison,
+        recipes: Recipes::of(study),
+        recommendations: recommended::recommendations(study),
         warnings,
         level: options.level,
         resamples: options.resamples,
@@ -389,260 +418,6 @@ fn shift_table(
             figures.fold((0.0, 0), |(sum, n), p| (sum + p.mean, n + 1))
         })
         .collect();
-    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against })
-}
-
-/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method has, the method with the fewest
-/// tasks is left out, one after the other, a floor last of all: a beginning of one method must not take the others' results away.
-fn compare(
-    study: &Study,
-    bootstrap: &Bootstrap,
-    tasks: &[Task],
-    scores: &[Vec<Vec<f64>>],
-) -> Result<Option<Comparison>> {
-    let has = |t: usize, m: usize| !scores[t][m].is_empty();
-    let count = |m: usize| (0..tasks.len()).filter(|t| has(*t, m)).count();
-    let mut kept: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) > 0).collect();
-    let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
-    let shared =
-        |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
-    let most = kept.iter().map(|m| count(*m)).max().unwrap_or(0);
-    while 2 * shared(&kept).len() < most.max(1) {
-        let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].floor, std::cmp::Reverse(**m)))
-        else {
-            return Ok(None);
-        };
-        kept.retain(|m| *m != last);
-        left_out.push(last);
-    }
-    if kept.is_empty() {
-        return Ok(None);
-    }
-    left_out.sort_unstable();
-    let places = shared(&kept);
-    let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());
-    let tables = kept.iter().map(|&m| of(m)).collect::<Result<Vec<_>, _>>()?;
-    let floors: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].floor).collect();
-    let table_of = |m: usize| &tables[kept.iter().position(|k| *k == m).expect("it is kept")];
-    let thresholds = thresholds(&tables);
-    // Profiles have a value for every threshold: a fifth of the resamples keeps them as fast as the rest.
-    let coarse = Bootstrap { resamples: (bootstrap.resamples / 5).max(1), ..*bootstrap };
-    let best_floor = (0..floors.len()).max_by(|a, b| {
-        let iqm = |k: &usize| table_of(floors[*k]).iqm();
-        iqm(a).total_cmp(&iqm(b))
-    });
-    let mut methods = Vec::new();
-    for (&m, scores) in kept.iter().zip(&tables) {
-        let method = &study.methods[m];
-        let statistics =
-            |s: &[&Scores]| vec![s[0].iqm(), s[0].median(), s[0].mean(), s[0].optimality_gap(GAMMA), s[0].total()];
-        let runs = bootstrap.intervals(&method.id, Draw::Runs, &[scores], statistics)?;
-        let both = bootstrap.intervals(&method.id, Draw::TasksAndRuns, &[scores], statistics)?;
-        let profile = coarse.intervals(&format!("profile/{}", method.id), Draw::Runs, &[scores], |s| {
-            thresholds.iter().map(|&t| s[0].share_above(t)).collect()
-        })?;
-        let improvements = |f: &usize| {
-            let name = format!("improvement/{}/{}", method.id, study.methods[*f].id);
-            let pair = [scores, table_of(*f)];
-            Ok(bootstrap.intervals(&name, Draw::Runs, &pair, |s| vec![probability_of_improvement(s[0], s[1])])?[0])
-        };
-        let over_floors = match method.floor {
-            true => None,
-            false => Some(floors.iter().map(improvements).collect::<Result<Vec<_>>>()?),
-        };
-        let p_value = match best_floor {
-            Some(k) if !method.floor => {
-                let floor = floors[k];
-                let name = format!("{}/{}", method.id, study.methods[floor].id);
-                Some(permutation_p(bootstrap.streams, &name, bootstrap.resamples, scores, table_of(floor))?)
-            }
-            _ => None,
-        };
-        methods.push(Aggregate {
-            method: m,
-            runs: scores.runs(),
-            over_seeds: [runs[0], runs[1], runs[2], runs[3]],
-            over_tasks: [both[0], both[1], both[2], both[3]],
-            total: runs[4],
-            profile,
-            over_floors,
-            p_value,
-        });
-    }
-    let tasks = places.iter().map(|&t| tasks[t]).collect();
-    Ok(Some(Comparison { tasks, methods, left_out, floors, best_floor, level: bootstrap.level, thresholds }))
-}
-
-/// Every second point from below the lowest score to above the highest, 0 and 100 included.
-fn thresholds(tables: &[Scores]) -> Vec<f64> {
-    let all = || tables.iter().flat_map(Scores::tasks).flatten().copied();
-    let low = (all().fold(0.0, f64::min) / 10.0).floor() * 10.0;
-    let high = (all().fold(100.0, f64::max) / 10.0).ceil() * 10.0;
-    // A return of a million is possible; a figure with a million points is none.
-    let step = ((high - low) / 60.0).max(2.0);
-    let n = ((high - low) / step).round() as usize;
-    (0..=n).map(|k| low + (high - low) * k as f64 / n as f64).collect()
-}
-
-fn plural(n: usize, one: &str, many: &str) -> String {
-    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
-}
-
-fn list<'a>(names: impl IntoIterator<Item = &'a str>) -> String {
-    names.into_iter().collect::<Vec<_>>().join(", ")
-}
-
-fn warnings(
-    study: &Study,
-    tasks: &[Task],
-    scores: &[Vec<Vec<f64>>],
-    comparison: Option<&Comparison>,
-    published: &[bool],
-) -> Vec<Warning> {
-    let mut out = Vec::new();
-    let mut warn = |text: String, details: Vec<String>| out.push(Warning { text, details });
-    let title = |m: usize| study.methods[m].title.as_str();
-
-    if !study.missing.is_empty() {
-        let all = study.runs.len() + study.missing.len();
-        warn(
-            format!(
-                "Partial results: {} of {all} runs have no result. They are counted nowhere; where they are not missing at random, \
-                 the figures are biased.",
-                study.missing.len()
-            ),
-            study.missing.iter().map(|m| format!("{}: {}", m.what, m.why)).collect(),
-        );
-    }
-    if !study.conflicts.is_empty() {
-        warn(
-            "Two copies of the same work came to different results; the first one is shown. This is a fault of determinism."
-                .into(),
-            study.conflicts.clone(),
-        );
-    }
-    let cases = |wanted: &dyn Fn(&Run) -> Option<String>| -> Vec<String> {
-        let case = |r: &Run| Some(format!("{}, {}, seed {}: {}", r.method, r.task, r.member.seed, wanted(r)?));
-        study.runs.iter().filter_map(case).collect()
-    };
-    let diverged = cases(&|r| match &r.member.verdict {
-        Verdict::Diverged(why) => Some(why.clone()),
-        _ => None,
-    });
-    if !diverged.is_empty() {
-        warn(
-            format!(
-                "{} could not act to the end of {} evaluation: counted as {DIVERGED} points, a random policy's score, and marked † in \
-                 the tables.",
-                plural(diverged.len(), "policy", "policies"),
-                if diverged.len() == 1 { "its" } else { "their" },
-            ),
-            diverged,
-        );
-    }
-    let unscored = cases(&|r| (r.member.verdict == Verdict::Unscored).then(|| "no score".into()));
-    if !unscored.is_empty() {
-        let n = plural(unscored.len(), "run has", "runs have");
-        warn(
-            format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
-            unscored,
-        );
-    }
-    let modes: Vec<&str> = (0..published.len()).filter(|m| published[*m]).map(title).collect();
-    if !modes.is_empty() {
-        warn(
-            format!(
-                "Published mode: {} follow the published code, its known faults included. They stand for what was published, not \
-                 for what the method can do.",
-                list(modes)
-            ),
-            Vec::new(),
-        );
-    }
-    let counts: BTreeSet<usize> = scores.iter().flatten().map(Vec::len).filter(|n| *n > 0).collect();
-    if let (Some(least), Some(most)) = (counts.first(), counts.last()) {
-        if *least < ENOUGH_SEEDS {
-            warn(
-                format!(
-                    "Few seeds: {} a task and method, where the paper has {ENOUGH_SEEDS}. Intervals from so few seeds are too \
-                     narrow{}.",
-                    if least == most { least.to_string() } else { format!("{least} to {most}") },
-                    if *least == 1 { ", and a task with one seed adds nothing to them" } else { "" },
-                ),
-                Vec::new(),
-            );
-        }
-        if least != most {
-            warn(
-                format!(
-                    "Unequal numbers of seeds, {least} to {most}. Every task has the same weight, and a run the share of its \
-                     task's."
-                ),
-                Vec::new(),
-            );
-        }
-    }
-    // Without `--no-floors` all four are there: a table without them is a choice that a reader has to know.
-    let bare: BTreeMap<&str, usize> = study
-        .methods
-        .iter()
-        .enumerate()
-        .filter(|(_, method)| method.floor)
-        .map(|(m, method)| (method.title.as_str(), scores.iter().filter(|t| t[m].is_empty()).count()))
-        .filter(|(_, missing)| *missing > 0)
-        .collect();
-    if !bare.is_empty() {
-        let part = |(title, n): (&&str, &usize)| format!("{title} on {n} of {}", tasks.len());
-        let parts: Vec<String> = bare.iter().map(part).collect();
-        warn(
-            format!("Floors are missing: {}. A score says little without the floor it has to beat.", parts.join("; ")),
-            Vec::new(),
-        );
-    }
-    match comparison {
-        None => warn("No run has a score: there are no statistics.".into(), Vec::new()),
-        Some(c) => {
-            if c.tasks.len() < tasks.len() {
-                warn(
-                    format!(
-                        "Aggregates are over the {} of {} tasks on which every compared method has a score.",
-                        c.tasks.len(),
-                        tasks.len()
-                    ),
-                    Vec::new(),
-                );
-            }
-            if !c.left_out.is_empty() {
-                warn(
-                    format!(
-                        "Not in the aggregates, for lack of scores on more than half of the tasks: {}.",
-                        list(c.left_out.iter().map(|m| title(*m)))
-                    ),
-                    Vec::new(),
-                );
-            }
-            let finding = |wanted: Finding| -> Vec<&str> {
-                let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);
-                c.methods.iter().filter(is).map(|a| title(a.method)).collect()
-            };
-            if let Some(floor) = c.best_floor() {
-                let worse = finding(Finding::Worse);
-                let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
-                if !worse.is_empty() {
-                    warn(format!("Below the best floor ({}): {}.", title(floor), list(worse)), Vec::new());
-                }
-                if !open.is_empty() {
-                    warn(format!("Not shown to beat the best floor ({}): {}.", title(floor), list(open)), Vec::new());
-                }
-            }
-        }
-    }
-    let programs: BTreeSet<&str> = study.runs.iter().map(|r| r.folder.program.as_str()).collect();
-    if programs.len() > 1 {
-        warn(format!("The runs were made by different programs: {}.", list(programs)), Vec::new());
-    }
-    for note in &study.notes {
-        warn(note.clone(), Vec::new());
-    }
-    out
+    let doubt = recipes::doubt(study, shift, &against);
+    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against, doubt })
 }

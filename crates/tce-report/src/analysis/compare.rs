@@ -1,0 +1,101 @@
+//! Methods beside each other.
+
+use tce_data::Task;
+
+use super::{Aggregate, Comparison, GAMMA};
+use crate::error::Result;
+use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improvement};
+use crate::study::Study;
+
+/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method has, the method with the fewest
+/// tasks is left out, one after the other, a floor last of all: a beginning of one method must not take the others' results away.
+pub(super) fn compare(
+    study: &Study,
+    bootstrap: &Bootstrap,
+    tasks: &[Task],
+    scores: &[Vec<Vec<f64>>],
+) -> Result<Option<Comparison>> {
+    let has = |t: usize, m: usize| !scores[t][m].is_empty();
+    let count = |m: usize| (0..tasks.len()).filter(|t| has(*t, m)).count();
+    let mut kept: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) > 0).collect();
+    let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
+    let shared =
+        |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
+    let most = kept.iter().map(|m| count(*m)).max().unwrap_or(0);
+    while 2 * shared(&kept).len() < most.max(1) {
+        let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].floor, std::cmp::Reverse(**m)))
+        else {
+            return Ok(None);
+        };
+        kept.retain(|m| *m != last);
+        left_out.push(last);
+    }
+    if kept.is_empty() {
+        return Ok(None);
+    }
+    left_out.sort_unstable();
+    let places = shared(&kept);
+    let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());
+    let tables = kept.iter().map(|&m| of(m)).collect::<Result<Vec<_>, _>>()?;
+    let floors: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].floor).collect();
+    let table_of = |m: usize| &tables[kept.iter().position(|k| *k == m).expect("it is kept")];
+    let thresholds = thresholds(&tables);
+    // Profiles have a value for every threshold: a fifth of the resamples keeps them as fast as the rest.
+    let coarse = Bootstrap { resamples: (bootstrap.resamples / 5).max(1), ..*bootstrap };
+    let best_floor = (0..floors.len()).max_by(|a, b| {
+        let iqm = |k: &usize| table_of(floors[*k]).iqm();
+        iqm(a).total_cmp(&iqm(b))
+    });
+    let mut methods = Vec::new();
+    for (&m, scores) in kept.iter().zip(&tables) {
+        let method = &study.methods[m];
+        let statistics =
+            |s: &[&Scores]| vec![s[0].iqm(), s[0].median(), s[0].mean(), s[0].optimality_gap(GAMMA), s[0].total()];
+        let runs = bootstrap.intervals(&method.id, Draw::Runs, &[scores], statistics)?;
+        let both = bootstrap.intervals(&method.id, Draw::TasksAndRuns, &[scores], statistics)?;
+        let profile = coarse.intervals(&format!("profile/{}", method.id), Draw::Runs, &[scores], |s| {
+            thresholds.iter().map(|&t| s[0].share_above(t)).collect()
+        })?;
+        let improvements = |f: &usize| {
+            let name = format!("improvement/{}/{}", method.id, study.methods[*f].id);
+            let pair = [scores, table_of(*f)];
+            Ok(bootstrap.intervals(&name, Draw::Runs, &pair, |s| vec![probability_of_improvement(s[0], s[1])])?[0])
+        };
+        let over_floors = match method.floor {
+            true => None,
+            false => Some(floors.iter().map(improvements).collect::<Result<Vec<_>>>()?),
+        };
+        let p_value = match best_floor {
+            Some(k) if !method.floor => {
+                let floor = floors[k];
+                let name = format!("{}/{}", method.id, study.methods[floor].id);
+                Some(permutation_p(bootstrap.streams, &name, bootstrap.resamples, scores, table_of(floor))?)
+            }
+            _ => None,
+        };
+        methods.push(Aggregate {
+            method: m,
+            runs: scores.runs(),
+            seeds: scores.tasks().iter().fold((usize::MAX, 0), |(l, h), t| (l.min(t.len()), h.max(t.len()))),
+            over_seeds: [runs[0], runs[1], runs[2], runs[3]],
+            over_tasks: [both[0], both[1], both[2], both[3]],
+            total: runs[4],
+            profile,
+            over_floors,
+            p_value,
+        });
+    }
+    let tasks = places.iter().map(|&t| tasks[t]).collect();
+    Ok(Some(Comparison { tasks, methods, left_out, floors, best_floor, level: bootstrap.level, thresholds }))
+}
+
+/// Every second point from below the lowest score to above the highest, 0 and 100 included.
+fn thresholds(tables: &[Scores]) -> Vec<f64> {
+    let all = || tables.iter().flat_map(Scores::tasks).flatten().copied();
+    let low = (all().fold(0.0, f64::min) / 10.0).floor() * 10.0;
+    let high = (all().fold(100.0, f64::max) / 10.0).ceil() * 10.0;
+    // A return of a million is possible; a figure with a million points is none.
+    let step = ((high - low) / 60.0).max(2.0);
+    let n = ((high - low) / step).round() as usize;
+    (0..=n).map(|k| low + (high - low) * k as f64 / n as f64).collect()
+}

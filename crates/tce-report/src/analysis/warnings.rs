@@ -1,0 +1,183 @@
+//! What a reader must know before believing a figure.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use tce_data::Task;
+
+use super::{Aggregate, Comparison, DIVERGED, ENOUGH_SEEDS, Finding, Warning, gap_words};
+use crate::folder::Verdict;
+use crate::study::{Run, Study};
+
+fn plural(n: usize, one: &str, many: &str) -> String {
+    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
+}
+
+fn list<'a>(names: impl IntoIterator<Item = &'a str>) -> String {
+    names.into_iter().collect::<Vec<_>>().join(", ")
+}
+
+pub(super) fn warnings(
+    study: &Study,
+    tasks: &[Task],
+    scores: &[Vec<Vec<f64>>],
+    comparison: Option<&Comparison>,
+    published: &[bool],
+) -> Vec<Warning> {
+    let mut out = Vec::new();
+    let mut warn = |text: String, details: Vec<String>| out.push(Warning { text, details });
+    let title = |m: usize| study.methods[m].title.as_str();
+
+    if !study.missing.is_empty() {
+        let all = study.runs.len() + study.missing.len();
+        warn(
+            format!(
+                "Partial results: {} of {all} runs have no result. They are counted nowhere; where they are not missing at random, \
+                 the figures are biased.",
+                study.missing.len()
+            ),
+            study.missing.iter().map(|m| format!("{}: {}", m.what, m.why)).collect(),
+        );
+    }
+    if !study.conflicts.is_empty() {
+        warn(
+            "Two copies of the same work came to different results; the first one is shown. This is a fault of determinism."
+                .into(),
+            study.conflicts.clone(),
+        );
+    }
+    let cases = |wanted: &dyn Fn(&Run) -> Option<String>| -> Vec<String> {
+        let case = |r: &Run| Some(format!("{}, {}, seed {}: {}", r.method, r.task, r.member.seed, wanted(r)?));
+        study.runs.iter().filter_map(case).collect()
+    };
+    let diverged = cases(&|r| match &r.member.verdict {
+        Verdict::Diverged(why) => Some(why.clone()),
+        _ => None,
+    });
+    if !diverged.is_empty() {
+        warn(
+            format!(
+                "{} could not act to the end of {} evaluation: counted as {DIVERGED} points, a random policy's score, and marked † in \
+                 the tables.",
+                plural(diverged.len(), "policy", "policies"),
+                if diverged.len() == 1 { "its" } else { "their" },
+            ),
+            diverged,
+        );
+    }
+    let unscored = cases(&|r| (r.member.verdict == Verdict::Unscored).then(|| "no score".into()));
+    if !unscored.is_empty() {
+        let n = plural(unscored.len(), "run has", "runs have");
+        warn(
+            format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
+            unscored,
+        );
+    }
+    let modes: Vec<&str> = (0..published.len()).filter(|m| published[*m]).map(title).collect();
+    if !modes.is_empty() {
+        warn(
+            format!(
+                "Published mode: {} follow the published code, its known faults included. They stand for what was published, not \
+                 for what the method can do.",
+                list(modes)
+            ),
+            Vec::new(),
+        );
+    }
+    let counts: BTreeSet<usize> = scores.iter().flatten().map(Vec::len).filter(|n| *n > 0).collect();
+    if let (Some(least), Some(most)) = (counts.first(), counts.last()) {
+        if *least < ENOUGH_SEEDS {
+            warn(
+                format!(
+                    "Few seeds: {} for each task and method, where the paper has {ENOUGH_SEEDS}. Intervals from so few seeds are too \
+                     narrow{}.",
+                    if least == most { least.to_string() } else { format!("{least} to {most}") },
+                    if *least == 1 { ", and a task with one seed does not widen them" } else { "" },
+                ),
+                Vec::new(),
+            );
+        }
+        if least != most {
+            warn(
+                format!(
+                    "Unequal numbers of seeds, {least} to {most}. Every task counts the same in a mean, however many runs it has."
+                ),
+                Vec::new(),
+            );
+        }
+    }
+    // Without `--no-floors` all four are there: a table without them is a choice that a reader has to know.
+    let bare: BTreeMap<&str, usize> = study
+        .methods
+        .iter()
+        .enumerate()
+        .filter(|(_, method)| method.floor)
+        .map(|(m, method)| (method.title.as_str(), scores.iter().filter(|t| t[m].is_empty()).count()))
+        .filter(|(_, missing)| *missing > 0)
+        .collect();
+    if !bare.is_empty() {
+        let part = |(title, n): (&&str, &usize)| format!("{title} on {n} of {}", tasks.len());
+        let parts: Vec<String> = bare.iter().map(part).collect();
+        warn(
+            format!(
+                "Baselines are missing: {}. A score says little without the baselines it has to beat.",
+                parts.join("; ")
+            ),
+            Vec::new(),
+        );
+    }
+    match comparison {
+        None => warn("No run has a score: there are no statistics.".into(), Vec::new()),
+        Some(c) => {
+            if c.tasks.len() < tasks.len() {
+                warn(
+                    format!(
+                        "Means over tasks are of the {} of {} tasks on which every compared method has a score.",
+                        c.tasks.len(),
+                        tasks.len()
+                    ),
+                    Vec::new(),
+                );
+            }
+            if !c.left_out.is_empty() {
+                warn(
+                    format!(
+                        "Left out of the means over tasks, for lack of scores on more than half of the tasks: {}.",
+                        list(c.left_out.iter().map(|m| title(*m)))
+                    ),
+                    Vec::new(),
+                );
+            }
+            let finding = |wanted: Finding| -> Vec<String> {
+                let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);
+                let gap = |a: &Aggregate| match gap_words(c.gap(a).unwrap_or(f64::NAN)) {
+                    level if level.starts_with("level") => "level".to_owned(),
+                    gap => gap,
+                };
+                c.methods.iter().filter(is).map(|a| format!("{} ({})", title(a.method), gap(a))).collect()
+            };
+            if let Some(floor) = c.best_floor() {
+                let worse = finding(Finding::Worse);
+                let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
+                if !worse.is_empty() {
+                    let names = list(worse.iter().map(String::as_str));
+                    warn(format!("Shown to fall short of the best baseline, {}: {names}.", title(floor)), Vec::new());
+                }
+                if !open.is_empty() {
+                    let names = list(open.iter().map(String::as_str));
+                    warn(
+                        format!("Not proved to differ from the best baseline, {}: {names}.", title(floor)),
+                        Vec::new(),
+                    );
+                }
+            }
+        }
+    }
+    let programs: BTreeSet<&str> = study.runs.iter().map(|r| r.folder.program.as_str()).collect();
+    if programs.len() > 1 {
+        warn(format!("The runs were made by different programs: {}.", list(programs)), Vec::new());
+    }
+    for note in &study.notes {
+        warn(note.clone(), Vec::new());
+    }
+    out
+}
