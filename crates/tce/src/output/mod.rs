@@ -1,46 +1,64 @@
-//! What a command prints: a table for people, JSON for programs.
+//! What a command prints: a table for people, JSON or CSV for programs.
 
-use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{Cell, CellAlignment, ContentArrangement, Table};
+use std::io::IsTerminal;
+
 use serde::Serialize;
+
+mod csv;
+mod table;
+mod wrap;
+
+pub use table::{heading, list, mark_best, table};
+pub use wrap::break_line;
+
+/// The form of the results.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// Tables and sentences.
+    Text,
+    /// One JSON document.
+    Json,
+    /// The rows of the JSON document, see [`csv`].
+    Csv,
+}
 
 /// Where and how results are printed. Progress and notes go to stderr, results to stdout.
 #[derive(Clone, Copy, Debug)]
 pub struct Output {
-    /// One JSON document instead of tables.
-    pub json: bool,
+    /// In which form.
+    pub form: Form,
 }
 
 impl Output {
-    /// Prints `value` as JSON, or what `render` makes of it.
+    /// Prints `value` as JSON or CSV, or what `render` makes of it.
     pub fn print<T: Serialize>(&self, value: &T, render: impl FnOnce(&T) -> String) {
         use std::io::Write;
-        let text = if self.json {
-            serde_json::to_string_pretty(value).expect("results are plain data")
-        } else {
-            render(value)
+        // The command is at its end, and so are its steps.
+        tce_base::end_course(true);
+        let text = match self.form {
+            Form::Json => serde_json::to_string_pretty(value).expect("results are plain data"),
+            Form::Csv => csv::of(&serde_json::to_string(value).expect("results are plain data")),
+            Form::Text => fit(&render(value)),
         };
         // A closed pipe (`tce ... | head`) is not an error of the command.
         let _ = writeln!(std::io::stdout(), "{}", text.trim_end());
     }
 }
 
-/// A table: the first column is text, the others are numbers and stand right-aligned.
-pub fn table<R, C>(header: &[&str], rows: impl IntoIterator<Item = R>) -> String
-where
-    R: IntoIterator<Item = C>,
-    C: Into<String>,
-{
-    let mut table = Table::new();
-    table.load_preset(UTF8_FULL_CONDENSED).set_content_arrangement(ContentArrangement::Disabled);
-    table.set_header(header.iter().map(Cell::new));
-    for row in rows {
-        table.add_row(row.into_iter().enumerate().map(|(i, cell)| {
-            let cell = Cell::new(cell.into());
-            if i == 0 { cell } else { cell.set_alignment(CellAlignment::Right) }
-        }));
-    }
-    table.to_string()
+/// `text` with lines no longer than they may be.
+pub fn fit(text: &str) -> String {
+    width().map_or_else(|| text.to_owned(), |width| wrap::text(text, width))
+}
+
+/// The columns that a line may have: `COLUMNS`, else the terminal's; None where results go to a file or a pipe, whose lines may be as long
+/// as they are.
+pub fn width() -> Option<usize> {
+    let told = std::env::var("COLUMNS").ok().and_then(|c| c.parse().ok()).filter(|c| *c >= 20);
+    let terminal = || {
+        let terminal = std::io::stdout().is_terminal().then(console::Term::stdout)?;
+        terminal.size_checked().map(|(_, columns)| usize::from(columns))
+    };
+    told.or_else(terminal)
 }
 
 /// Mean and sample standard deviation.
@@ -66,11 +84,5 @@ mod tests {
         assert_eq!(mean_std(&[1.0, 2.0, 3.0]), (2.0, 1.0));
         assert_eq!(plus_minus(&[1.0, 2.0, 3.0]), "2.0 ± 1.0");
         assert_eq!(plus_minus(&[61.7]), "61.7");
-    }
-
-    #[test]
-    fn tables_hold_every_cell() {
-        let text = table(&["set", "score"], [["hopper", "100.1"]]);
-        assert!(text.contains("set") && text.contains("hopper") && text.contains("100.1"), "{text}");
     }
 }

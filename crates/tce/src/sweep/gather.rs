@@ -10,7 +10,7 @@ use tce_base::first_damaged;
 use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
 use crate::error::{Error, Result};
-use crate::output::{plus_minus, table};
+use crate::output::{mark_best, plus_minus, table};
 
 /// One finished run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -153,7 +153,9 @@ impl Gathered {
         let header: Vec<&str> = std::iter::once("task").chain(methods.iter().copied()).collect();
         let rows = tasks.iter().map(|task| {
             let cell = |method: &&str| cells.get(&(*task, *method)).map_or("-".into(), |s| plus_minus(s));
-            std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect::<Vec<_>>()
+            let mut cells: Vec<_> = std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect();
+            mark_best(cells.iter_mut().skip(1));
+            cells
         });
         let mut text = table(&header, rows);
         let problems = self.missing.len() + self.corrupt.len() + self.conflicts.len();
