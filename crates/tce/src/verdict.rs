@@ -94,6 +94,7 @@ pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]
         return Ok(Verdict { method: name.clone(), policy: policy.clone(), sure: true, reason, tried: Vec::new() });
     }
     let judge = judge()?;
+    tce_base::begin_step("verdict");
     let try_all =
         |c: &Candidate| -> Result<Vec<Judged>> { c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect() };
     let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
