@@ -1,19 +1,24 @@
 //! What every crate of the workspace stands on: named random streams, files that are never half-written, and long
 //! work that shows its progress and can be interrupted.
 
+pub mod course;
 pub mod files;
+pub mod format;
+pub mod interrupt;
 pub mod owner;
 pub mod progress;
 pub mod random;
 pub mod sealed;
 pub mod words;
 
+pub use course::{Headline, Step, begin_step, end_course, plan_course};
 pub use files::{
     AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
     read_if_there, sha256_file, sha256_hex, write_atomically, write_json, write_json_first,
 };
+pub use interrupt::{interrupted, listen_for_interrupts};
 pub use owner::Owner;
-pub use progress::{Progress, interrupted, listen_for_interrupts, set_quiet};
+pub use progress::{Progress, set_quiet};
 pub use random::{Rng, Streams};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use words::{did_you_mean, file_inside, nearest};

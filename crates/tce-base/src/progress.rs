@@ -1,30 +1,82 @@
-//! Long work: a bar with an ETA on a terminal, a plain line now and then elsewhere; and the wish to stop.
+//! Long work: a bar with what is left on a terminal, a plain line now and then elsewhere.
 
 use std::io::IsTerminal;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
-use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
-use signal_hook::iterator::Signals;
+use console::style;
+use indicatif::{MultiProgress, ProgressBar, ProgressState, ProgressStyle};
+
+use crate::course;
+use crate::format::{count, duration, rate};
 
 /// Time between two plain lines where there is no terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(15);
+/// Time between two looks at a bar that does not move, so that what is left does not stand still.
+const TICK: Duration = Duration::from_millis(500);
 
-/// The progress of one piece of work of known length. Cheap to call often; safe to share between threads.
+/// All lines that change in place. One thing draws them, so that bars side by side and notes between them leave no line behind.
+pub(crate) static LINES: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
+
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Whether progress that starts from now on is shown at all.
+pub fn set_quiet(quiet: bool) {
+    QUIET.store(quiet, Ordering::Relaxed);
+}
+
+/// Whether lines can change in place.
+pub(crate) fn in_place() -> bool {
+    static TERMINAL: LazyLock<bool> =
+        LazyLock::new(|| std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb"));
+    *TERMINAL && !QUIET.load(Ordering::Relaxed)
+}
+
+/// A line of text on stderr, above all bars. Written by [`note!`](crate::note).
+#[doc(hidden)]
+pub fn say(text: &str) {
+    let print = || match text.strip_prefix("warning:") {
+        Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
+        None => eprintln!("{text}"),
+    };
+    // Without bars there is nothing to put aside.
+    if in_place() { LINES.suspend(print) } else { print() }
+}
+
+/// `eprintln!` for notes beside the results: where bars are drawn, the note stands above them.
+#[macro_export]
+macro_rules! note {
+    ($($text:tt)*) => { $crate::progress::say(&format!($($text)*)) };
+}
+
+/// How far a piece of work is. Apart from the bar, because the line above the bars asks while they are drawn.
+pub(crate) struct Counter {
+    pub(crate) label: String,
+    pub(crate) total: u64,
+    pub(crate) done: AtomicU64,
+    pub(crate) started: Instant,
+}
+
+impl Counter {
+    /// Seconds that are left at the rate so far; None where that says nothing yet.
+    pub(crate) fn left(&self) -> Option<f64> {
+        let (done, seconds) = (self.done.load(Ordering::Relaxed), self.started.elapsed().as_secs_f64());
+        (done > 0 && seconds > 2.0).then(|| self.total.saturating_sub(done) as f64 * seconds / done as f64)
+    }
+}
+
+/// The progress of one piece of work of known length. Cheap to call often; safe to share between threads. A bar that is dropped before
+/// its end leaves no line.
 pub struct Progress {
-    label: String,
     unit: &'static str,
-    total: u64,
+    counter: Arc<Counter>,
     bar: Option<ProgressBar>,
-    started: Instant,
     quiet: bool,
     plain: Mutex<Plain>,
 }
 
 struct Plain {
-    done: u64,
     last: Instant,
     message: String,
 }
@@ -32,49 +84,39 @@ struct Plain {
 impl Progress {
     /// Starts a bar for `total` units of `unit` ("rows", "steps").
     pub fn new(label: impl Into<String>, total: u64, unit: &'static str) -> Self {
-        let label = label.into();
-        let quiet = QUIET.load(Ordering::Relaxed);
-        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
-            let style = "{prefix:<22} {bar:30} {human_pos}/{human_len} {per_sec:>12} {eta:>5} {msg}";
-            let bar = ProgressBar::new(total).with_prefix(label.clone());
-            bar.set_style(ProgressStyle::with_template(style).expect("a constant template"));
+        let started = Instant::now();
+        let counter = Arc::new(Counter { label: label.into(), total, done: AtomicU64::new(0), started });
+        course::works(&counter);
+        let bar = in_place().then(|| {
+            let bar = ProgressBar::new(total).with_prefix(counter.label.clone()).with_style(bar_style());
+            let bar = LINES.add(bar);
+            bar.enable_steady_tick(TICK);
             bar
         });
-        let now = Instant::now();
-        Self {
-            label,
-            unit,
-            total,
-            bar,
-            started: now,
-            quiet,
-            plain: Mutex::new(Plain { done: 0, last: now, message: String::new() }),
-        }
+        let plain = Mutex::new(Plain { last: started, message: String::new() });
+        Self { unit, counter, bar, quiet: QUIET.load(Ordering::Relaxed), plain }
     }
 
     /// Reports that `n` more units are done.
     pub fn inc(&self, n: u64) {
+        let done = self.counter.done.fetch_add(n, Ordering::Relaxed) + n;
         if let Some(bar) = &self.bar {
             bar.inc(n);
             return;
         }
+        if self.quiet {
+            return;
+        }
         let mut plain = self.plain.lock().expect("progress is never poisoned");
-        plain.done += n;
-        if !self.quiet && plain.last.elapsed() >= PLAIN_INTERVAL {
+        if plain.last.elapsed() >= PLAIN_INTERVAL {
             plain.last = Instant::now();
-            let seconds = self.started.elapsed().as_secs_f64();
-            let rate = plain.done as f64 / seconds;
-            let left = self.total.saturating_sub(plain.done) as f64 / rate.max(1e-9);
-            eprintln!(
-                "{}: {}/{} {} ({:.0}/s, {} left) {}",
-                self.label,
-                plain.done,
-                self.total,
-                self.unit,
-                rate,
-                duration(left),
-                plain.message
-            );
+            let Counter { label, total, started, .. } = &*self.counter;
+            let per_second = done as f64 / started.elapsed().as_secs_f64();
+            let left = total.saturating_sub(done) as f64 / per_second.max(1e-9);
+            let (done, total, left) = (count(done), count(*total), duration(left));
+            let line =
+                format!("{label}: {done}/{total} {} ({}, {left} left) {}", self.unit, rate(per_second), plain.message);
+            say(line.trim_end());
         }
     }
 
@@ -88,64 +130,83 @@ impl Progress {
 
     /// Ends the bar and returns the seconds it took.
     pub fn finish(&self) -> f64 {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-        let seconds = self.started.elapsed().as_secs_f64();
-        let rate = self.total as f64 / seconds.max(1e-9);
+        self.clear();
+        let Counter { label, total, started, .. } = &*self.counter;
+        let seconds = started.elapsed().as_secs_f64();
         if !self.quiet {
-            eprintln!("{}: {} {} in {} ({:.0}/s)", self.label, self.total, self.unit, duration(seconds), rate);
+            say(&done_line(label, *total, self.unit, seconds));
         }
         seconds
     }
-}
 
-fn duration(seconds: f64) -> String {
-    match seconds {
-        s if s < 60.0 => format!("{s:.1} s"),
-        s if s < 5400.0 => format!("{:.0} min {:02.0} s", (s / 60.0).floor(), s % 60.0),
-        s => format!("{:.1} h", s / 3600.0),
+    fn clear(&self) {
+        if let Some(bar) = &self.bar
+            && !bar.is_finished()
+        {
+            bar.finish_and_clear();
+            LINES.remove(bar);
+        }
     }
 }
 
-static QUIET: AtomicBool = AtomicBool::new(false);
-
-/// Whether progress that starts from now on is shown at all.
-pub fn set_quiet(quiet: bool) {
-    QUIET.store(quiet, Ordering::Relaxed);
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.clear();
+    }
 }
 
-static INTERRUPTED: AtomicBool = AtomicBool::new(false);
-
-/// From now on SIGINT, SIGTERM and SIGUSR1 (a batch system's warning before its time limit) set a flag that long work looks at
-/// ([`interrupted`]). A SIGINT or SIGTERM more than a second later ends the process.
-pub fn listen_for_interrupts() {
-    let Ok(mut signals) = Signals::new([SIGINT, SIGTERM, SIGUSR1]) else { return };
-    let listen = move || {
-        let mut first = None;
-        for signal in signals.forever() {
-            // One wish to stop is often two signals at once: `timeout` sends one to the process and one to its group.
-            let patience = first.get_or_insert_with(Instant::now).elapsed();
-            if signal != SIGUSR1 && patience > Duration::from_secs(1) {
-                signal_hook::low_level::exit(130);
-            }
-            INTERRUPTED.store(true, Ordering::Relaxed);
-        }
+/// One line of at most the terminal's width: a longer one would wrap, and leave a line behind whenever it is drawn anew.
+fn bar_style() -> ProgressStyle {
+    let template = "{prefix:22!} {wide_bar:.cyan/dim} {human_pos}/{human_len} {rate:>9} {left:>12} {msg:11!}";
+    let style = ProgressStyle::with_template(template).expect("a constant template");
+    // What cannot be written into a line is left out of it.
+    let write_rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        let _ = out.write_str(&rate(state.per_sec()));
     };
-    let _ = std::thread::Builder::new().name("signals".into()).spawn(listen);
+    let write_left = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        // At the beginning nobody knows.
+        let known = state.pos() > 0 && state.elapsed() > Duration::from_secs(1);
+        let left = if known { short(state.eta().as_secs_f64()) } else { String::new() };
+        let _ = out.write_str(&left);
+    };
+    style.with_key("rate", write_rate).with_key("left", write_left).progress_chars("━━─")
 }
 
-/// Whether the user asked to stop. Long loops ask once per step and leave at the next safe point.
-pub fn interrupted() -> bool {
-    INTERRUPTED.load(Ordering::Relaxed)
+/// What is left of a bar.
+fn short(seconds: f64) -> String {
+    match seconds {
+        s if s < 60.0 => format!("{s:.0} s left"),
+        s if s < 5400.0 => format!("{:.0} min left", s / 60.0),
+        s => format!("{:.1} h left", s / 3600.0),
+    }
+}
+
+/// What was done, and the time it took.
+fn done_line(label: &str, total: u64, unit: &str, seconds: f64) -> String {
+    match total {
+        0 => format!("{label}: nothing was left to do"),
+        n => format!("{label}: {} {unit} in {} ({})", count(n), duration(seconds), rate(n as f64 / seconds.max(1e-9))),
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
     #[test]
-    fn durations_read_well() {
-        assert_eq!(super::duration(3.25), "3.2 s");
-        assert_eq!(super::duration(125.0), "2 min 05 s");
-        assert_eq!(super::duration(7200.0), "2.0 h");
+    fn a_done_line_says_the_total_and_the_time() {
+        assert_eq!(done_line("learn bc [0]", 12_000, "steps", 5.4225), "learn bc [0]: 12,000 steps in 5.4 s (2,213/s)");
+        assert_eq!(done_line("sweep", 3, "pieces of work", 400.0), "sweep: 3 pieces of work in 6 min 40 s (27.0/h)");
+        assert_eq!(done_line("train q_mix", 0, "steps", 0.0), "train q_mix: nothing was left to do");
+    }
+
+    #[test]
+    fn what_is_left_is_short() {
+        assert_eq!([4.2, 125.0, 7200.0].map(short), ["4 s left", "2 min left", "2.0 h left"]);
+    }
+
+    #[test]
+    fn the_template_is_one() {
+        bar_style();
     }
 }

@@ -30,14 +30,15 @@ use crate::neighbours::Units;
 use crate::{DataError, NeighbourOptions, Rows, nn_distances};
 
 /// The settings of [`density_scores`]; see the [module](self).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DensityOptions {
-    /// k, at least 2: the nearest neighbour in a row's own set is the row itself.
+    /// k, which nearest neighbour distances are measured to; a row's nearest in its own set is the row itself.
+    #[schemars(range(min = 2, max = 1000000))]
     pub neighbour: usize,
-    /// Most source rows that distances are measured to; with fewer source rows the result is exact.
+    /// Most source rows that distances are measured to; with fewer source rows the result is exact. Source: DmC takes all.
     pub reference: usize,
-    /// Whether D is the squared distance.
+    /// Whether the distance is squared before its logarithm is taken. Source: DmC's index gives squared ones.
     pub squared: bool,
 }
 

@@ -72,7 +72,7 @@ impl FromStr for Shift {
 }
 
 /// Whose reference returns to use. They differ for Walker2d, and in the digits printed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ScoreTable {
     /// OTDF's and ODRL's own programs: what published scores were computed with.

@@ -19,7 +19,7 @@ use tce_base::random::fill_normal;
 use crate::DiffusionError;
 
 /// Which noise. In files: `kind = "ve" | "vp" | "edm"` beside the fields of the variant.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum Process {
     /// Appendix B.
@@ -37,21 +37,22 @@ pub enum Process {
 /// | α_min, α_max | `alpha_min`, `alpha_max` | 0.1, 20 | Table C.4 |
 /// | smallest τ | `tau_min` | 1e-5 | own; σ(1e-3) = .0105 is a third of a step in Hopper's finest dimensions |
 /// | s^K | `start` | `normal` | Algorithm 1 |
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Ve {
-    /// α_min
+    /// α_min, the rate of noise at the beginning. Source: Table C.4.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub alpha_min: f64,
-    /// α_max
+    /// α_max, the rate of noise at the end. Source: Table C.4.
     pub alpha_max: f64,
-    /// Smallest τ in training and sampling.
+    /// Smallest time τ in training and sampling. Source: own.
     pub tau_min: f64,
     /// Where sampling starts.
     pub start: Start,
 }
 
 /// Where [`Ve`] starts sampling.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Start {
     /// N(0, I), as written.
@@ -66,16 +67,18 @@ pub enum Start {
 /// | symbol | field | default | source |
 /// |---|---|---|---|
 /// | largest σ/α | `ratio_max` | 20 | own, as σ_max of [`Edm`]: deterministic samplers start there and not at the 152 of τ = 1, where the noise network's error counts 152 times (HalfCheetah, 6k steps: sliced Wasserstein .040 instead of .056, largest value 20 instead of 49) |
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Vp {
-    /// α_min
+    /// α_min, the rate of noise at the beginning. Source: Table C.4.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub alpha_min: f64,
-    /// α_max
+    /// α_max, the rate of noise at the end. Source: Table C.4.
     pub alpha_max: f64,
-    /// Smallest τ in training and sampling.
+    /// Smallest time τ in training and sampling. Source: own.
     pub tau_min: f64,
-    /// σ/α from which deterministic samplers start.
+    /// Noise over signal from which deterministic samplers start. Source: own.
+    #[schemars(range(min = 1.0))]
     pub ratio_max: f64,
 }
 
@@ -88,20 +91,24 @@ pub struct Vp {
 /// | ρ | `rho` | 7 | their Table 1 |
 /// | P_mean, P_std | `p_mean`, `p_std` | −1.2, 1.2 | their Table 1: ln σ ~ N(P_mean, P_std²) in training |
 /// | σ_data | `sigma_data` | 1 | rows are standardised |
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Edm {
-    /// Smallest σ of the sampling grid.
+    /// Smallest σ of the sampling grid. Source: Karras et al., Table 1.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub sigma_min: f64,
-    /// Largest σ of the sampling grid.
+    /// Largest σ of the sampling grid: rows have unit variance, and 20 loses less of it on a short grid than the authors' 80.
     pub sigma_max: f64,
-    /// Exponent of the sampling grid.
+    /// ρ, the exponent of the sampling grid. Source: Karras et al., Table 1.
+    #[schemars(range(min = 1.0))]
     pub rho: f64,
-    /// Mean of ln σ in training.
+    /// Mean of ln σ in training. Source: Karras et al., Table 1.
     pub p_mean: f64,
-    /// Standard deviation of ln σ in training.
+    /// Standard deviation of ln σ in training. Source: Karras et al., Table 1.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub p_std: f64,
-    /// Standard deviation of the data.
+    /// Standard deviation of the data; rows are standardised.
+    #[schemars(extend("exclusiveMinimum" = 0))]
     pub sigma_data: f64,
 }
 

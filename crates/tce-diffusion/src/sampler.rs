@@ -45,15 +45,16 @@ impl<A: Denoiser, B: Denoiser> Denoiser for Guided<A, B> {
 }
 
 /// Which sampler.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampler {
     /// Euler–Maruyama steps of the reverse SDE, each followed by Langevin steps at the new noise level.
     PredictorCorrector {
-        /// K
+        /// K, the steps from noise to a row.
         #[serde(default = "five_hundred")]
+        #[schemars(range(min = 2))]
         steps: usize,
-        /// r of the step size η = 2 α (r ‖ζ‖ / ‖q‖)², norms averaged over the rows of a chunk.
+        /// r, the signal-to-noise ratio of the step size η = 2 α (r ‖ζ‖ / ‖q‖)², norms averaged over the rows of a chunk.
         #[serde(default = "song")]
         snr: f64,
         /// Langevin steps per predictor step.
@@ -62,27 +63,31 @@ pub enum Sampler {
     },
     /// Euler–Maruyama steps of the reverse SDE alone.
     EulerMaruyama {
-        /// K
+        /// K, the steps from noise to a row.
         #[serde(default = "five_hundred")]
+        #[schemars(range(min = 2))]
         steps: usize,
     },
     /// Second-order steps of the probability-flow ODE in (x / α, σ / α).
     Heun {
-        /// N
+        /// N, the steps from noise to a row.
         #[serde(default = "eighteen")]
+        #[schemars(range(min = 2))]
         steps: usize,
     },
     /// Second-order multistep solution in ln(α / σ), DPM-Solver++(2M).
     DpmSolver {
-        /// N
+        /// N, the steps from noise to a row.
         #[serde(default = "twenty")]
+        #[schemars(range(min = 2))]
         steps: usize,
     },
     /// The same of the reverse SDE, SDE-DPM-Solver++(2M): every step adds fresh noise, which forgives the errors of the
     /// steps before.
     SdeDpmSolver {
-        /// N
+        /// N, the steps from noise to a row.
         #[serde(default = "twenty")]
+        #[schemars(range(min = 2))]
         steps: usize,
     },
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 ///
 /// Hopper moves some dimensions by 3-4 % of their spread per step: generating the difference puts the network's error on
 /// the scale of the step instead of the scale of the state.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Target {
     /// s' itself, as the paper has it.

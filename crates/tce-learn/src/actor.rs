@@ -38,7 +38,7 @@ use crate::training::member_noise;
 const FREE_LOG_STD_RANGE: (f32, f32) = (-5.0, 2.0);
 
 /// What kind of distribution a policy is; see the [module](self).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyForm {
     /// Deterministic.
@@ -51,7 +51,7 @@ pub enum PolicyForm {
 }
 
 /// How the squared errors of an action's components become one number.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ActionReduction {
     /// Their mean.
@@ -62,18 +62,18 @@ pub enum ActionReduction {
 }
 
 /// The policy's part of a learner's configuration; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActorConfig {
-    /// Kind of distribution.
+    /// Kind of distribution. IQL chooses it by `policy_extraction` and `regulariser`, whatever is written here.
     pub form: PolicyForm,
-    /// Widths of the hidden layers.
+    /// Widths of the hidden layers of the policy.
     pub hidden: Vec<usize>,
-    /// Learning rate at the beginning.
+    /// Learning rate of the policy at the beginning.
     pub lr: f64,
-    /// Whether it falls to 0 over the training along a cosine.
+    /// Whether the learning rate falls to 0 over the training along a cosine.
     pub cosine: bool,
-    /// Over an action's components, for the forms with a squared error.
+    /// How the squared errors of an action's components become one number, for the forms with a squared error.
     pub action_reduction: ActionReduction,
 }
 

@@ -33,14 +33,16 @@ use crate::policy::Policy;
 use crate::training::{Learner, Meter, PolicyLearner};
 
 /// The configuration of [`Bc`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BcConfig {
     /// The policy.
     pub actor: ActorConfig,
-    /// Policies that are averaged.
+    /// Policies that are trained side by side; their outputs are averaged before the tanh.
+    #[schemars(range(min = 1, max = 64))]
     pub ensemble: usize,
-    /// Most steps where rows besides the target's are cloned, too; 0: as many as without them.
+    /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
+    /// as without them.
     pub mixed_steps: u64,
 }
 

@@ -46,32 +46,40 @@ use crate::td3_bc::normalised_value;
 use crate::training::{Learner, Meter, Place, prepare};
 
 /// The configuration of [`Bosa`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BosaConfig {
-    /// Where critics bootstrap.
+    /// Where critics bootstrap: where a row is not terminal, or, as the public code has it, where it is.
     pub mode: Mode,
-    /// ε
+    /// ε, the density of a row's successor below which the critics do not learn from the row. Source: ODRL.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e+30))]
     pub threshold: f64,
-    /// λ_Q
+    /// λ_Q, the weight of the values of source rows, which the critics keep small. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub value_weight: f64,
-    /// λ_π
+    /// λ_π, the weight of the log density of the policy's actions under the behaviour model. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub support_weight: f64,
-    /// n
+    /// n, the models of s' given s and a. Source: ODRL.
+    #[schemars(range(min = 1, max = 1000))]
     pub ensemble: usize,
-    /// K
+    /// K, the samples behind an estimated density. Source: ODRL.
+    #[schemars(range(min = 1, max = 10000))]
     pub samples: usize,
-    /// Standard deviation of the decoders' densities.
+    /// Standard deviation of the decoders' densities. Source: ODRL, √(β/4) with β = .5.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1000000.0))]
     pub std: f64,
     /// The autoencoders; `batch` counts rows of both domains.
     pub cvae: CvaeConfig,
-    /// γ
+    /// γ, the discount factor. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub discount: f64,
     /// σ, c, d, ρ
     pub delay: DelayConfig,
-    /// Learning rate of the critics, constant.
+    /// Learning rate of the critics, constant. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub critic_lr: f64,
-    /// Hidden layers of the critics.
+    /// Widths of the hidden layers of the critics. Source: ODRL.
     pub hidden: Vec<usize>,
     /// The policy; its `form` is tanh mean.
     pub actor: ActorConfig,

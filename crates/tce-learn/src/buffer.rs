@@ -313,7 +313,7 @@ pub(crate) fn split(batch: usize, parts: &[Arc<Transitions>]) -> Vec<usize> {
 }
 
 /// How rewards are scaled before they reach a critic.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RewardScale {
     /// As they are.

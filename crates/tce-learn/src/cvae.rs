@@ -37,20 +37,20 @@ use crate::training::{Learner, Meter, Place, member_noise, prepare};
 const LOG_STD_RANGE: (f32, f32) = (-4.0, 15.0);
 
 /// The configuration of a [`CvaeLearner`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CvaeConfig {
-    /// Hidden layers of encoder and decoder.
+    /// Widths of the hidden layers of encoder and decoder. Source: OTDF, 750 and 750.
     pub hidden: Vec<usize>,
-    /// Latent dimensions per dimension of what is modelled.
+    /// Latent dimensions per dimension of what is modelled. Source: OTDF.
     pub latent_per_action: usize,
-    /// Weight of the divergence.
+    /// Weight of the divergence from the prior beside the reconstruction. Source: OTDF.
     pub kl_weight: f64,
-    /// Learning rate, constant.
+    /// Learning rate of the autoencoder, constant. Source: OTDF.
     pub lr: f64,
-    /// Training steps.
+    /// Training steps of the autoencoder, before the learner's first. Source: OTDF, 10 000.
     pub steps: u64,
-    /// Target rows per step.
+    /// Target rows per step; for BOSA, rows of both domains. Source: OTDF.
     pub batch: usize,
 }
 

@@ -41,20 +41,24 @@ use crate::training::{Meter, member_noise};
 const TINY: f64 = 1e-10;
 
 /// The configuration of [`Dara`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DaraConfig {
-    /// How often the classifiers' outputs go through a softmax.
+    /// How often the classifiers' outputs go through a softmax: once as meant, twice as the public code has it.
     pub mode: Mode,
-    /// η
+    /// η, the weight of the classifiers' correction of the source's rewards. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub eta: f64,
-    /// c
+    /// c, the greatest correction before η multiplies it, up or down. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub clip: f64,
-    /// σ
+    /// σ, the noise on the classifiers' inputs in training. Source: ODRL, on raw inputs.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub noise: f64,
-    /// Hidden layers of the classifiers.
+    /// Widths of the hidden layers of the classifiers. Source: ODRL.
     pub hidden: Vec<usize>,
-    /// Learning rate of the classifiers, constant.
+    /// Learning rate of the classifiers, constant. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lr: f64,
 }
 

@@ -26,16 +26,20 @@ use crate::policy::Policy;
 use crate::training::{Learner, Meter, PolicyLearner, member_noise};
 
 /// Smoothing and delay; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DelayConfig {
-    /// σ
+    /// σ of the noise on the target policy's actions. Source: TD3.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub std: f64,
-    /// c
+    /// c, the greatest noise on the target policy's actions. Source: TD3.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub clip: f64,
-    /// d
+    /// d, critic steps per step of the policy. Source: TD3.
+    #[schemars(range(min = 1, max = 1000000))]
     pub every: u64,
-    /// ρ
+    /// ρ, how far target networks follow in one step. Source: TD3.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub polyak: f64,
 }
 

@@ -42,14 +42,16 @@ use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
 
 /// The configuration of [`Dmc`], besides [`IqlConfig`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmcConfig {
-    /// Whose.
+    /// Whose form: weights for each row and a trained behaviour model, or what the public code does.
     pub mode: Mode,
-    /// Share of the other rows of a batch that is left out.
+    /// Share of the source and generated rows of a batch that is left out, those with the lowest scores. Source: DmC.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub cut_off: f64,
-    /// β_reg
+    /// β_reg, the weight of the behaviour term in the policy's loss. Source: DmC's scripts.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub beta_reg: f64,
 }
 

@@ -37,18 +37,19 @@ use crate::losses::{binary_cross_entropy, member_mean};
 use crate::training::{Learner, Meter, Steps, train};
 
 /// The configuration of [`Dynamics`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DynamicsConfig {
     /// Networks of the ensemble.
     pub members: usize,
-    /// Hidden layers.
+    /// Widths of the hidden layers of the learned dynamics.
     pub hidden: Vec<usize>,
-    /// Training steps.
+    /// Training steps of the learned dynamics.
     pub steps: u64,
-    /// Rows per network and step.
+    /// Rows per network and step, half of them the target's.
+    #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Learning rate at the beginning.
+    /// Learning rate of the learned dynamics at the beginning.
     pub lr: f64,
 }
 

@@ -39,7 +39,7 @@ use crate::selection::{Selected, host_from, need_others};
 use crate::training::{Learner, Meter, Place, prepare};
 
 /// Whose code [`Mode::Published`] follows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Code {
     /// φ and ψ are never trained.
@@ -50,26 +50,32 @@ pub enum Code {
 }
 
 /// The configuration of [`Igdf`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IgdfConfig {
     /// As meant, or with the defect of `code`.
     pub mode: Mode,
-    /// Whose defect; nothing where `mode` is corrected.
+    /// Whose defect `mode = "published"` has; nothing where `mode` is corrected.
     pub code: Code,
-    /// ξ
+    /// ξ, the share of a batch's source rows that the critics see, those with the highest scores. Source: ODRL, .25 and .5 on some
+    /// tasks.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub keep: f64,
-    /// α
+    /// α, how strongly a source row's score decides its weight in the critics' loss. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub weight: f64,
-    /// k
+    /// k, the width of the representations φ and ψ. Source: ODRL.
+    #[schemars(range(min = 1, max = 100000))]
     pub features: usize,
-    /// Hidden layers of φ and ψ.
+    /// Widths of the hidden layers of φ and ψ. Source: ODRL.
     pub hidden: Vec<usize>,
-    /// Learning rate of φ and ψ, constant.
+    /// Learning rate of φ and ψ, constant. Source: ODRL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lr: f64,
-    /// Training steps of φ and ψ.
+    /// Training steps of φ and ψ, before the learner's first. Source: ODRL.
     pub steps: u64,
-    /// Target rows of such a step.
+    /// Target rows of a step of φ and ψ; 127 source rows stand against all of them. Source: ODRL.
+    #[schemars(range(min = 2, max = 1000000))]
     pub batch: usize,
 }
 

@@ -48,7 +48,7 @@ use crate::training::{Learner, Meter, PolicyLearner};
 const DEAD_WEIGHT: f32 = 0.01;
 
 /// How the critics' advantages reach the policy.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyExtraction {
     /// Weighted squared error of a deterministic policy (or of a tanh-Gaussian's mean).
@@ -61,34 +61,41 @@ pub enum PolicyExtraction {
 }
 
 /// The configuration of [`Iql`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IqlConfig {
-    /// τ
+    /// τ_V, the expectile of Q that V is regressed on. Source: Eq. B.12, Appendix B.2.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub expectile: f64,
-    /// β
+    /// β_Adv, how sharply the policy prefers actions with an advantage. Source: Eq. B.14, Appendix B.2: 3.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub temperature: f64,
-    /// Greatest weight of a row.
+    /// Greatest weight of a row in the policy's loss. Source: IQL's authors, OTDF.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e+30))]
     pub weight_cap: f64,
-    /// γ
+    /// γ, the discount factor. Source: OTDF, IQL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub discount: f64,
-    /// ρ
+    /// ρ, how far target networks follow in one step. Source: OTDF, IQL.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub polyak: f64,
-    /// Learning rate of V and Q, constant.
+    /// Learning rate of V and Q, constant. Source: Table C.4.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub critic_lr: f64,
-    /// Hidden layers of V and Q.
+    /// Widths of the hidden layers of V and Q. Source: OTDF, IQL.
     pub hidden: Vec<usize>,
     /// The policy; its `form` follows from `policy_extraction` and `regulariser`.
     pub actor: ActorConfig,
-    /// From advantages to a policy.
+    /// How advantages become a policy. Source: OTDF as meant.
     pub policy_extraction: PolicyExtraction,
-    /// Units of the advantage.
+    /// Units of the advantage before β_Adv multiplies it. Source: the paper's are raw.
     pub advantage: AdvantageScale,
-    /// Scale of the rewards; whoever makes the buffer applies it.
+    /// What rewards are multiplied by before a critic sees them. Source: OTDF does without.
     pub reward_scale: RewardScale,
-    /// β_reg
+    /// β_reg, the weight of the behaviour term in the policy's loss. Source: Table C.5.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub beta_reg: f64,
-    /// What keeps the policy near the target's behaviour.
+    /// What keeps the policy near the target's behaviour. Source: Eq. 10 is forward_kl.
     pub regulariser: RegulariserKind,
 }
 

@@ -29,18 +29,19 @@ use crate::pair_model::{PairConfig, PairModel, PairTarget};
 use crate::training::{Learner, Meter, Steps, train};
 
 /// The configuration of [`train_labels`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelConfig {
     /// The networks.
     pub model: PairConfig,
-    /// Training steps.
+    /// Training steps of inverse dynamics and reward models. Source: Table C.4: 39 000.
     pub steps: u64,
-    /// Rows per step.
+    /// Target rows per step. Source: Table C.4.
+    #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Share of the target rows kept for [`LabelErrors`].
+    /// Share of the target rows on which the errors of the label models are measured.
     pub held_out: f64,
-    /// Whether to train a classifier of terminals too.
+    /// Whether a classifier of terminal rows is trained, too. A run sets it by `labels.terminal`, whatever is written here.
     pub learn_terminals: bool,
 }
 

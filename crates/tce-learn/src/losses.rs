@@ -25,7 +25,7 @@ pub fn expectile_loss(u: Tensor<3>, tau: f64) -> Tensor<3> {
 }
 
 /// In what units the advantage enters the exponent.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum AdvantageScale {
     /// In units of the reward, as published.

@@ -46,34 +46,47 @@ use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes
 use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
 
 /// The configuration of [`MetaDt`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MetaDtConfig {
-    /// K
+    /// K, the steps that the transformer sees. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 1024))]
     pub context: usize,
-    /// Width of a token.
+    /// Width of a token. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub embed: usize,
-    /// Blocks.
+    /// Blocks of the transformer. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub layers: usize,
-    /// Heads of attention; they share the width of a token.
+    /// Heads of attention; they share the width of a token. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub heads: usize,
-    /// Share of the activations that are dropped.
+    /// Share of the activations that are dropped in training. Source: Meta-DT.
+    #[schemars(range(min = 0.0, max = 0.99))]
     pub dropout: f64,
-    /// Steps of an episode that are told apart.
+    /// Steps of an episode that are told apart; later ones look like the last. Source: episodes of MuJoCo.
+    #[schemars(range(min = 1, max = 10000000))]
     pub timesteps: usize,
-    /// Learning rate after the warm-up.
+    /// Learning rate after the warm-up. Source: Meta-DT.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lr: f64,
-    /// Decoupled weight decay, multiplied by the learning rate.
+    /// Decoupled weight decay, multiplied by the learning rate. Source: Meta-DT.
+    #[schemars(range(min = 0.0, max = 1000.0))]
     pub weight_decay: f64,
-    /// Steps over which the learning rate rises from 0.
+    /// Steps over which the learning rate rises from 0. Source: Meta-DT.
     pub warm_up: u64,
-    /// Greatest norm of the gradient.
+    /// Greatest norm of the gradient. Source: Meta-DT.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1000000000.0))]
     pub grad_clip: f64,
-    /// Segments per step.
+    /// Segments of episodes per step, half of them the target's. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub batch: usize,
-    /// Divides returns to go.
+    /// What returns to go are divided by. Source: Meta-DT.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1000000000000.0))]
     pub return_scale: f64,
-    /// R̂_1 over the best return of a trajectory of the target.
+    /// How many times the best return of a trajectory of the target an evaluation asks for. Source: own; the expert's return, which
+    /// a user does not know, was asked for by others.
+    #[schemars(range(min = -1000000.0, max = 1000000.0))]
     pub return_factor: f64,
     /// What the contexts come from.
     pub world_model: WorldModelConfig,

@@ -40,16 +40,19 @@ use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
 
 /// The configuration of [`Otdf`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct OtdfConfig {
-    /// How advantages reach the policy.
+    /// Whether every row is cloned with its own weight, or, as the public code has it, with the mean weight of its batch.
     pub mode: Mode,
-    /// Share of a batch's source rows that is kept.
+    /// Share of a batch's source rows that the critics see: those with the least cost of transport to the target. Source: OTDF's
+    /// command line; its file says .25.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub keep: f64,
-    /// Whether kept source rows weigh exp(d̂) in L_Q.
+    /// Whether a source row's cost of transport decides its weight in the critics' loss. Source: OTDF.
     pub weighted: bool,
-    /// β_reg
+    /// β_reg, the weight of the behaviour term in the policy's loss. Source: OTDF; .1 for the kinematic shift.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub beta_reg: f64,
 }
 

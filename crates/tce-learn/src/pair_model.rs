@@ -32,7 +32,7 @@ use crate::error::{LearnError, within};
 use crate::losses::{member_mean, squared_error};
 
 /// How the successor reaches the network.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PairInput {
     /// As the difference s' - s in units of its own spread.
@@ -43,20 +43,21 @@ pub enum PairInput {
 }
 
 /// The configuration of a [`PairModel`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PairConfig {
-    /// How s' reaches the network.
+    /// How s' reaches the label networks: as it is, or as its difference from s. Source: Table B.1 has next.
     pub input: PairInput,
-    /// Width of every layer.
+    /// Width of every layer of the label networks. Source: Table B.1.
     pub width: usize,
-    /// Residual blocks.
+    /// Residual blocks of the label networks. Source: Table B.1.
     pub blocks: usize,
-    /// Drop rate of the last block.
+    /// Share of the rows for which the last block is left out in training; earlier blocks have less. Source: Table B.1 names
+    /// DropPath without a number.
     pub drop_path: f64,
-    /// Learning rate at the beginning.
+    /// Learning rate of the label networks at the beginning. Source: Table C.4.
     pub lr: f64,
-    /// Whether it falls to 0 along a cosine.
+    /// Whether the learning rate falls to 0 over the training along a cosine.
     pub cosine: bool,
 }
 

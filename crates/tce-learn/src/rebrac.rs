@@ -31,20 +31,26 @@ use crate::td3_bc::normalised_value;
 use crate::training::Meter;
 
 /// The configuration of [`Rebrac`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RebracConfig {
-    /// β_π
+    /// β_π, the weight of the distance to the data's action in the policy's loss. Source: own; Tarasov et al. choose from .001 to 1
+    /// for each task.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub actor_penalty: f64,
-    /// β_Q
+    /// β_Q, the weight of the same distance at the next state, in the critics' target. Source: own; Tarasov et al. choose from 0 to
+    /// 1 for each task.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub critic_penalty: f64,
-    /// γ
+    /// γ, the discount factor. Source: Tarasov et al.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub discount: f64,
     /// σ, c, d, ρ
     pub delay: DelayConfig,
-    /// Learning rate of the critics, constant.
+    /// Learning rate of the critics, constant. Source: own; theirs is 1e-3 at batches of 1024.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub critic_lr: f64,
-    /// Hidden layers of the critics.
+    /// Widths of the hidden layers of the critics. Source: Tarasov et al.
     pub hidden: Vec<usize>,
     /// The policy; its `form` is tanh mean.
     pub actor: ActorConfig,

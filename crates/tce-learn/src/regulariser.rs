@@ -29,7 +29,7 @@ use crate::losses::member_mean;
 use crate::training::Place;
 
 /// Which term; see the [module](self).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RegulariserKind {
     /// No term.
@@ -42,16 +42,16 @@ pub enum RegulariserKind {
 }
 
 /// The constants of the terms; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RegulariserConfig {
     /// The behaviour model.
     pub cvae: CvaeConfig,
-    /// Actions drawn per target row for `forward_kl`.
+    /// Actions drawn from the behaviour model per target row, for the regulariser `forward_kl`. Source: own.
     pub draws: usize,
-    /// K of `otdf`.
+    /// K, the samples behind a density of the behaviour model, for the regulariser `otdf`. Source: OTDF.
     pub samples: usize,
-    /// Standard deviation of the decoder's density in `otdf`.
+    /// β, the standard deviation of the decoder's density, for the regulariser `otdf`. Source: OTDF, √(.4/4).
     pub std: f64,
 }
 

@@ -37,20 +37,25 @@ use crate::selection::{best_others, kept_rows};
 use crate::training::Meter;
 
 /// The configuration of [`Srpo`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SrpoConfig {
-    /// What is clamped.
+    /// What enters the reward: the odds of the discriminator, or, as the public code has it, its logit.
     pub mode: Mode,
-    /// λ
+    /// λ, the weight of the discriminator's term in the rewards. Source: IGDF's repository, .3 on some tasks.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub lambda: f64,
-    /// ρ
+    /// ρ, the share of a batch's states, those of the highest value, that the discriminator is shown as good. Source: IGDF's
+    /// repository, .2 on some tasks.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub share: f64,
-    /// c
+    /// c, the greatest odds that count; 1/c is the least. Source: IGDF's repository.
+    #[schemars(range(min = 1.0, max = 1000000.0))]
     pub clip: f64,
-    /// Hidden layers of the discriminator.
+    /// Widths of the hidden layers of the discriminator. Source: IGDF's repository.
     pub hidden: Vec<usize>,
-    /// Learning rate of the discriminator, constant.
+    /// Learning rate of the discriminator, constant. Source: IGDF's repository.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lr: f64,
 }
 

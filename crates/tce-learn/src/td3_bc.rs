@@ -29,18 +29,21 @@ use crate::losses::member_mean;
 use crate::training::Meter;
 
 /// The configuration of [`Td3Bc`]; see the [module](self).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3BcConfig {
-    /// α
+    /// α, the weight of the value beside the distance to the data's action in the policy's loss. Source: Fujimoto and Gu.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
     pub alpha: f64,
-    /// γ
+    /// γ, the discount factor. Source: Fujimoto and Gu.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub discount: f64,
     /// σ, c, d, ρ
     pub delay: DelayConfig,
-    /// Learning rate of the critics, constant.
+    /// Learning rate of the critics, constant. Source: Fujimoto and Gu.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub critic_lr: f64,
-    /// Hidden layers of the critics.
+    /// Widths of the hidden layers of the critics. Source: Fujimoto and Gu.
     pub hidden: Vec<usize>,
     /// The policy; its `form` is tanh mean.
     pub actor: ActorConfig,

@@ -363,7 +363,10 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
                 let figures = (step, std::mem::take(&mut run.meter));
                 let report = Report::from(figures.clone());
                 for member in report.diverged() {
-                    eprintln!("{label}: member {} has diverged at step {step} (a loss is not finite)", k + member);
+                    tce_base::note!(
+                        "{label}: member {} has diverged at step {step} (a loss is not finite)",
+                        k + member
+                    );
                 }
                 match keep_end {
                     true => run.history.push(figures),

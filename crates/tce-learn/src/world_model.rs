@@ -130,26 +130,33 @@ impl WorldModel {
 }
 
 /// How the world model is made and trained; see the [module](self) and [`crate::meta_dt`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldModelConfig {
-    /// Training steps, before the transformer's.
+    /// Training steps of the world model, before the transformer's first. Source: own; Meta-DT: 201 passes over its data.
     pub steps: u64,
-    /// Learning rate, constant.
+    /// Learning rate of the world model, constant. Source: Meta-DT.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lr: f64,
-    /// Rows per step.
+    /// Rows per step of the world model. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub batch: usize,
-    /// Greatest norm of the gradient.
+    /// Greatest norm of the world model's gradient. Source: Meta-DT.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1000000000.0))]
     pub grad_clip: f64,
-    /// h
+    /// h, the steps that a context is made of. Source: own: as many as the transformer sees.
+    #[schemars(range(min = 1, max = 65536))]
     pub horizon: usize,
-    /// Width of each part of f.
+    /// Width of what is made of a state, an action and a reward, each. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub features: usize,
-    /// Width of the GRU.
+    /// Width of the recurrent network that reads the steps. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub gru: usize,
-    /// Width of z.
+    /// Width of the context z. Source: Meta-DT.
+    #[schemars(range(min = 1, max = 65536))]
     pub latent: usize,
-    /// Hidden layers of the decoders.
+    /// Widths of the hidden layers of the decoders. Source: Meta-DT.
     pub hidden: Vec<usize>,
 }
 

@@ -58,7 +58,7 @@ impl Checkpoints {
             };
             let number = |p: &NamedParameters, key: &str| p.metadata.get(key).and_then(|v| v.parse::<u64>().ok());
             match read.and_then(|p| Some((number(&p, GENERATION)?, number(&p, STEP)?, p))) {
-                None => eprintln!("{}: damaged, passed over", path.display()),
+                None => tce_base::note!("{}: damaged, passed over", path.display()),
                 Some((g, step, parameters)) if g >= generation => {
                     generation = g;
                     restored = Some((step, parameters, path.clone()));

@@ -150,7 +150,7 @@ impl Ledger {
         };
         match whole("previous.json") {
             Ok(Some(ledger)) => {
-                eprintln!("{damage}; going on from the checkpoint before, at step {}", ledger.step);
+                tce_base::note!("{damage}; going on from the checkpoint before, at step {}", ledger.step);
                 Ok(Some(ledger))
             }
             _ => Err(damage),

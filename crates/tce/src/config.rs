@@ -1,5 +1,6 @@
-//! The configuration of a run, typed. The keys and their sources are documented in `presets/default.toml`; where a
-//! value comes from is told by [`crate::layers`].
+//! The configuration of a run, typed. What a field's comment says is what `tce config show KEY` tells a user ([`crate::keys`]): a sentence on
+//! what the key does, and behind `Source:` where its value is from, if it is the same for every preset. Why a preset has a value is told
+//! beside the value, in `presets/`; where a value comes from, by [`crate::layers`].
 
 use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
@@ -11,41 +12,50 @@ use tce_learn::{
 
 use crate::error::{Error, Result};
 
-/// Everything that decides a run's result, apart from its data and seeds. The keys and their sources are documented in
-/// `presets/default.toml`, which `tce config show` prints.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Everything that decides a run's result, apart from its data and seeds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct Config {
-    /// Sweeps that were planned, and runs that were done, before there was this table have the whole target.
+    /// The target data: how much of them is used, and which trajectories are imitated.
+    // Sweeps that were planned, and runs that were done, before there was this table have the whole target.
     #[serde(default)]
     pub target: TargetConfig,
+    /// Source data that a task does not bring along.
     pub source: SourceConfig,
+    /// The two score networks q_mix and q_tran, and how they are sampled.
     pub generator: GeneratorConfig,
+    /// Which generated rows are left out.
     pub filter: FilterConfig,
+    /// Inverse dynamics and reward models, and where terminal flags come from.
     pub labels: LabelsConfig,
-    /// Runs that were done before there was this table used no learned dynamics.
+    /// Learned dynamics of both domains, by which policies are tried and, with `filter.by = "consistency"`, rows are filtered.
+    // Runs that were done before there was this table used no learned dynamics.
     #[serde(default)]
     pub dynamics: DynamicsConfig,
+    /// One network over whole rows, for `mixture.generated` = synther and dmc.
     pub joint: JointConfig,
+    /// The data the policy is learned from.
     pub mixture: MixtureConfig,
+    /// The learner of the policy.
     pub learner: LearnerConfig,
+    /// How policies are judged.
     pub evaluation: EvaluationConfig,
 }
 
 /// How much of the target data is used.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct TargetConfig {
+    /// How many rows of the target file are used, from the first on, as if the log had ended there. 0: all of them.
     pub rows: usize,
-    /// Runs that were done before there was this key imitate all of them.
+    /// Which of the target's trajectories are imitated.
+    // Runs that were done before there was this key imitate all of them.
     #[serde(default)]
     pub trajectories: Trajectories,
 }
 
 /// Which of the target's trajectories are imitated.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Trajectories {
     /// All of them.
@@ -56,36 +66,54 @@ pub enum Trajectories {
 }
 
 /// Source data that a task does not bring along.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct SourceConfig {
+    /// How many source rows are collected where a task names no source file. Source: Table C.1.
+    #[schemars(range(min = 1))]
     pub rows: usize,
 }
 
 /// The two score networks and how they are sampled.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct GeneratorConfig {
+    /// The noise process of the score networks, chosen by its `kind`.
     pub process: Process,
+    /// How rows are drawn from the score networks, chosen by its `kind`.
     pub sampler: Sampler,
+    /// What q_tran generates: the next state, or its difference from the state. Source: the paper has the next state.
     pub target: Target,
+    /// Updates of q_mix, the network over states, or "auto": until it no longer helps (`generator.until_done`).
     pub state_steps: Length,
+    /// Updates of q_tran, the network from a state to the next one, or "auto": until it no longer helps (`generator.until_done`).
     pub transition_steps: Length,
-    /// Runs that were done before there was this table have fixed lengths.
+    /// When training ends where a length is "auto".
+    // Runs that were done before there was this table have fixed lengths.
     #[serde(default)]
     pub until_done: UntilDoneConfig,
+    /// Rows per update of a score network. Source: Table C.4.
+    #[schemars(range(min = 1))]
     pub batch: usize,
+    /// Learning rate of the score networks at the beginning. Source: Table C.4: 1e-4.
     pub learning_rate: f64,
+    /// The learning rate over the updates.
     pub schedule: Schedule,
+    /// Share of its past that the averaged network keeps in each update. 0: no average.
+    #[schemars(range(min = 0.0, max = 0.999999))]
     pub ema: f64,
+    /// Whether half of each batch of q_mix is from the target and half from the source. Otherwise rows are drawn evenly from both.
     pub balanced: bool,
+    /// Whether q_mix sees source states. Without them this is Simple Aug. Source: Table 3.
     pub source_states: bool,
-    /// Runs that were done before there was this key did without.
+    /// Whether generated rows keep to what both data sets keep to: clipped ranges, constants, unit quaternions. Source: own.
+    // Runs that were done before there was this key did without.
     #[serde(default)]
     pub support: bool,
+    /// How far generated states may go from the target's to the source's: ŷ ~ U(0, y_max). Source: Table C.5.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub y_max: f32,
+    /// Rows that are generated per seed, before filtering. 0: (1 - λ) times the source rows. Source: the paper has 0.
     pub rows: usize,
 }
 
@@ -104,6 +132,16 @@ impl Serialize for Length {
             Length::Steps(steps) => to.serialize_u64(*steps),
             Length::Auto => to.serialize_str("auto"),
         }
+    }
+}
+
+impl schemars::JsonSchema for Length {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Length".into()
+    }
+
+    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        schemars::json_schema!({ "anyOf": [{ "type": "integer", "minimum": 0 }, { "const": "auto" }] })
     }
 }
 
@@ -134,19 +172,20 @@ impl<'de> Deserialize<'de> for Length {
 }
 
 /// When a network whose length is `"auto"` is done.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct UntilDoneConfig {
-    /// Updates of the first cycle; every further one is twice as long.
+    /// Updates of the first cycle; every further one is twice as long. Source: own.
     pub first: u64,
-    /// Updates that all cycles of q_mix together may take.
+    /// Most updates of all cycles of q_mix together. Source: own.
     pub state_limit: u64,
-    /// Updates that all cycles of q_tran together may take.
+    /// Most updates of all cycles of q_tran together. Source: own.
     pub transition_limit: u64,
     /// Share by which a cycle has to lower q_mix's held-out loss, or the error of the actions that q_tran implies at held-out
-    /// states, for another one to follow.
+    /// states, for another one to follow. Source: own.
     pub gain: f64,
-    /// Share of the target rows that is held out.
+    /// Share of the target rows that is held out, in runs of 25 steps. Source: own.
+    #[schemars(range(min = 0.001, max = 0.5))]
     pub held_out: f64,
 }
 
@@ -169,16 +208,22 @@ impl UntilDoneConfig {
 }
 
 /// Which generated rows are left out.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct FilterConfig {
+    /// Whether generated rows are filtered.
     pub enabled: bool,
+    /// By what rows are told to be bad.
     #[serde(default, skip_serializing_if = "FilterKind::is_zscore")]
     pub by: FilterKind,
+    /// How many standard deviations from the mean a dimension of a row may be, with `by = "zscore"`. Source: Eq. 8, Table C.5.
+    #[schemars(range(min = 0.1, max = 1000000000.0))]
     pub z_threshold: f64,
-    /// In runs that were done before there was this key the z-score decides.
+    /// How many times the error that 95 % of held-out real rows stay below a row's error may be, with `by = "consistency"`. Source:
+    /// own.
+    // In runs that were done before there was this key the z-score decides.
     #[serde(default = "FilterConfig::default_margin", skip_serializing_if = "FilterConfig::is_default_margin")]
+    #[schemars(range(min = 0.01, max = 1000000000.0))]
     pub margin: f64,
 }
 
@@ -198,7 +243,7 @@ impl FilterConfig {
 }
 
 /// By what rows are told to be bad.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FilterKind {
     /// A dimension far from the mean of the generated rows (Eq. 8). It cuts the start of every episode.
@@ -215,16 +260,17 @@ impl FilterKind {
 }
 
 /// Inverse dynamics and reward models, and where terminal flags come from.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct LabelsConfig {
+    /// Where a generated row's terminal flag comes from. Source: the paper says nothing.
     pub terminal: Terminal,
+    /// Training of inverse dynamics and reward models, on the target rows.
     pub training: LabelConfig,
 }
 
 /// Where a generated row's terminal flag comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Terminal {
     /// Never terminal.
@@ -236,23 +282,41 @@ pub enum Terminal {
 }
 
 /// The network over whole transitions, for `mixture.generated` = synther and dmc, and how it is sampled.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct JointConfig {
+    /// The noise process of the joint network, chosen by its `kind`.
     pub process: Process,
+    /// How rows are drawn from the joint network, chosen by its `kind`.
     pub sampler: Sampler,
+    /// What stands in a generated row for s': s' itself, or its difference from s. Source: SynthER and DmC have the next state.
     pub target: Target,
+    /// Width of the joint network's layers. Source: SynthER, DmC: 2048.
+    #[schemars(range(min = 1))]
     pub width: usize,
+    /// Width of the embedding of the noise level.
+    #[schemars(range(min = 1))]
     pub embedding: usize,
+    /// Residual blocks of the joint network. Source: SynthER, DmC: 6.
     pub blocks: usize,
+    /// Training steps of the joint network. Source: SynthER, DmC: 100 000.
     pub steps: u64,
+    /// Rows per step of the joint network. Source: SynthER, DmC: 1024, 256 for small data.
+    #[schemars(range(min = 1))]
     pub batch: usize,
+    /// Learning rate of the joint network at the beginning. Source: SynthER, DmC: 3e-4.
     pub learning_rate: f64,
+    /// The learning rate over the steps.
     pub schedule: Schedule,
+    /// Share of its past that the averaged network keeps in each step. 0: no average.
+    #[schemars(range(min = 0.0, max = 0.999999))]
     pub ema: f64,
+    /// Rows that are generated per seed. Source: SynthER: 5M; DmC: as many as source rows, at least 1M.
+    #[schemars(range(min = 1))]
     pub rows: usize,
+    /// How scores guide DmC's generator.
     pub guidance: GuidanceConfig,
+    /// How source rows are scored: 1 / (1 + ρ - min ρ), ρ the log ratio of distances to target and source neighbours. Source: DmC.
     pub scores: DensityOptions,
 }
 
@@ -276,18 +340,24 @@ impl JointConfig {
 }
 
 /// How scores guide DmC's generator.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct GuidanceConfig {
+    /// Share of training rows that the network sees without their score. Source: DmC.
+    #[schemars(range(min = 0.0, max = 0.999))]
     pub dropout: f64,
+    /// w, how strongly rows are drawn towards their score. Source: DmC.
+    #[schemars(range(min = 0.0, max = 100.0))]
     pub weight: f64,
+    /// Rows are drawn under the whole percentiles of the training scores from this one to the 99th, equally likely. Source: DmC.
+    #[schemars(range(min = 0.0, max = 0.99))]
     pub from: f64,
+    /// Whether a generated row's score is measured anew. Otherwise it keeps the one that it was drawn under.
     pub rescore: bool,
 }
 
 /// Which generated rows join the target rows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum GeneratedRows {
     /// None.
@@ -301,7 +371,7 @@ pub enum GeneratedRows {
 }
 
 /// Which source rows join the target rows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SourceRows {
     /// None of them.
@@ -317,17 +387,20 @@ pub enum SourceRows {
 }
 
 /// The data the policy is learned from.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct MixtureConfig {
+    /// Which generated rows join the target rows.
     pub generated: GeneratedRows,
+    /// Which source rows join the target rows.
     pub source: SourceRows,
+    /// λ, the share of source rows in the mixture; the rest are generated. Source: Eq. 9, Table C.5.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub lambda: f64,
 }
 
 /// Which algorithm learns the policy; what each of them is, `tce learn --list` tells ([`crate::methods`]).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Algorithm {
     /// Behaviour cloning.
@@ -355,26 +428,44 @@ pub enum Algorithm {
 }
 
 /// The learner; the keys of algorithms that are not trained are not looked at.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct LearnerConfig {
+    /// Which algorithm learns the policy; `tce learn --list` tells what each is. Source: the paper has iql.
     pub algorithm: Algorithm,
+    /// Training steps of the policy.
     pub steps: u64,
+    /// Rows per step. With other rows half of them are the target's; else all are. Source: Table C.4.
+    #[schemars(range(min = 1))]
     pub batch: usize,
+    /// Whether observations are standardised.
     pub standardise: bool,
+    /// Share of the best trajectories that `bc` clones. 1: all of them. Source: "BC-10 %" of Chen et al.
+    #[schemars(range(min = 0.001, max = 1.0))]
     pub top: f64,
+    /// Implicit Q-learning, and what the rivals that stand on it take from it.
     pub iql: IqlConfig,
+    /// Behaviour cloning.
     pub bc: BcConfig,
+    /// TD3+BC. Source: Fujimoto and Gu.
     pub td3_bc: Td3BcConfig,
+    /// ReBRAC. Source: Tarasov et al.
     pub rebrac: RebracConfig,
+    /// DARA, besides `learner.iql`.
     pub dara: DaraConfig,
+    /// SRPO, besides `learner.iql`.
     pub srpo: SrpoConfig,
+    /// IGDF, besides `learner.iql`.
     pub igdf: IgdfConfig,
+    /// OTDF, besides `learner.iql`; its regulariser is `learner.behaviour`.
     pub otdf: OtdfConfig,
+    /// BOSA.
     pub bosa: BosaConfig,
+    /// DmC, besides `learner.iql`.
     pub dmc: DmcConfig,
+    /// Meta-DT; `learner.steps` are the transformer's.
     pub meta_dt: MetaDtConfig,
+    /// The model of the target's behaviour, for regularisers.
     pub behaviour: RegulariserConfig,
 }
 
@@ -472,12 +563,15 @@ impl LearnerConfig {
 }
 
 /// How policies are judged.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
 pub struct EvaluationConfig {
+    /// Episodes of an evaluation.
+    #[schemars(range(min = 1))]
     pub episodes: usize,
+    /// Steps between evaluations on the way. 0: only the last policy is evaluated.
     pub every: u64,
+    /// Whose reference returns a normalised score is measured by.
     pub scores: ScoreTable,
 }
 

@@ -58,6 +58,7 @@ pub fn label_models(
     let learn_terminals = terminals(inputs, config) == Terminal::Learned;
     let labels = LabelConfig { learn_terminals, ..config.training.clone() };
     let spec = Spec { inputs: inputs.spec(learn_terminals), seeds, labels: &labels };
+    tce_base::begin_step("label models");
     let stage = Stage::open(root, "stages/labels", &spec, device)?;
     let target = Arc::new(inputs.target.rows.clone());
     let mut parts = vec![target.clone()];
@@ -214,7 +215,7 @@ fn support(inputs: &Inputs) -> Support {
     let rows: Vec<&[f32]> =
         tables.flat_map(|t| [t.rows.observations.as_slice(), t.rows.next_observations.as_slice()]).collect();
     let support = Support::fit(&rows, inputs.target.rows.obs_dim);
-    support.describe().iter().for_each(|finding| eprintln!("generated rows respect: {finding}"));
+    support.describe().iter().for_each(|finding| tce_base::note!("generated rows respect: {finding}"));
     support
 }
 
@@ -256,6 +257,7 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         filter: &config.filter,
         terminal: config.labels.terminal,
     };
+    tce_base::begin_step("generated rows");
     let stage = Stage::open(root, "stages/generated", &spec, device)?;
     let (reports, tables) = match stage.summary::<Vec<Generated>>()? {
         Some(reports) => {

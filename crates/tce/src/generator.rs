@@ -107,6 +107,7 @@ impl Generator {
             balanced: g.balanced,
             source_states: g.source_states,
         };
+        tce_base::begin_step("score networks");
         let stage = Stage::open(root, "stages/networks", &spec, device)?;
         let files = ["state.safetensors", "transition.safetensors"];
         if let Some(trained) = stage.summary::<Trained>()? {

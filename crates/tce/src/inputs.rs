@@ -24,6 +24,7 @@ const LEAST_ROWS: usize = 10;
 
 /// The files of a benchmark task, and where results go.
 #[derive(Clone, Debug, clap::Args)]
+#[command(next_help_heading = "Data")]
 pub struct DataArgs {
     /// Source data (default: collected from the zoo's actors, or from those in TCE_SHARED where the zoo lacks one).
     #[arg(long, value_name = "FILE")]
@@ -93,7 +94,7 @@ pub struct Behaviour {
 impl Table {
     fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
         let Loaded { transitions, report, .. } = load(path, options)?;
-        eprintln!("{report}");
+        tce_base::note!("{report}");
         Ok(Self::new(transitions, path, sha256_file(&main_file(path))?))
     }
 
@@ -240,7 +241,7 @@ impl Inputs {
         }
         let wild = if own.action_range.is_none() { ActionRange::with_outliers(&rows) } else { Vec::new() };
         if !wild.is_empty() {
-            eprintln!(
+            tce_base::note!(
                 "warning: action columns {wild:?} have values more than ten times what 99.9 % of them are: all others become small inside. Remove \
                  them, or give --action-range"
             );
@@ -250,20 +251,20 @@ impl Inputs {
                 let range = range_of(given, rows[0].act_dim, &self.target.file).map_err(Error::Usage)?;
                 let outside: usize = rows.iter().map(|t| range.outside(&t.actions)).sum();
                 if outside > 0 {
-                    eprintln!("warning: {outside} action values lie outside of --action-range {range}");
+                    tce_base::note!("warning: {outside} action values lie outside of --action-range {range}");
                 }
                 Some(range)
             }
             // The benchmark's robots take actions in the box, and clamp others.
             (None, Some(agent)) => {
                 if let Some(found) = &found {
-                    eprintln!("warning: actions range over {found}; {agent} clamps them to [-1, 1]");
+                    tce_base::note!("warning: actions range over {found}; {agent} clamps them to [-1, 1]");
                 }
                 None
             }
             (None, None) => {
                 if let Some(found) = &found {
-                    eprintln!(
+                    tce_base::note!(
                         "actions range over {found}: scaled to [-1, 1] inside; generated rows and policies are in these units \
                          (--action-range sets others)"
                     );
@@ -391,7 +392,7 @@ impl Inputs {
             ensure_same_agent(&other.rows, &self.target.rows, self.agent)?;
             let (a, b) = (infer_agents(&other.rows), infer_agents(&self.target.rows));
             if self.agent.is_none() && !a.is_empty() && !b.is_empty() && !a.iter().any(|x| b.contains(x)) {
-                eprintln!(
+                tce_base::note!(
                     "note: {} looks like {}, {} like {}; if these are robots of the benchmark, they are not the same one",
                     other.file.display(),
                     a[0],

@@ -324,9 +324,11 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         GeneratedRows::Dmc => Some(scores(inputs, &j.scores, root)?),
         _ => None,
     };
+    tce_base::begin_step("joint network");
     let (model, trained, network) = train(inputs, kind, j, scored.as_ref(), seeds, root, device)?;
     let guidance = scored.as_ref().map(|_| j.guidance.clone());
     let spec = Spec { network: network.name(), sampler: j.sampler, rows: j.rows, guidance };
+    tce_base::begin_step("generated rows");
     let stage = Stage::open(root, "stages/generated", &spec, device)?;
     if let Some(reports) = stage.summary::<Vec<Generated>>()? {
         return read(stage, reports, scored.is_some());

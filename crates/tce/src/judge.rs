@@ -80,6 +80,7 @@ impl Judge {
             held_out: f64,
         }
         let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out: HELD_OUT };
+        tce_base::begin_step("learned dynamics");
         let stage = Stage::open(root, "stages/dynamics", &spec, device)?;
         let target = &inputs.target.rows;
         let (kept, apart) = hold_out_runs(target.len(), HELD_OUT);

@@ -35,6 +35,27 @@ pub enum Preset {
 }
 
 impl Preset {
+    /// All of them.
+    pub const ALL: [Preset; 3] = [Preset::Paper, Preset::Default, Preset::Quick];
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Preset::Paper => "paper",
+            Preset::Default => "default",
+            Preset::Quick => "quick",
+        }
+    }
+
+    /// The preset's own file, with its comments; `default` lists every key.
+    pub fn text(self) -> &'static str {
+        match self {
+            Preset::Paper => PAPER,
+            Preset::Default => DEFAULT,
+            Preset::Quick => QUICK,
+        }
+    }
+
     fn layer(self) -> (&'static str, &'static str) {
         match self {
             Preset::Paper => ("preset paper", PAPER),
@@ -235,14 +256,15 @@ fn paper_values(task: Task) -> String {
 
 /// What commands with a configuration accept.
 #[derive(Clone, Debug, Default, clap::Args)]
+#[command(next_help_heading = "Settings")]
 pub struct ConfigArgs {
     /// Where the configuration starts from.
     #[arg(long, value_enum, default_value_t)]
     pub preset: Preset,
-    /// A TOML file with the keys to change (`tce config show` lists them).
+    /// A TOML file with the keys to change. `tce config show` lists them; `tce config show KEY` explains one.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// One key to change, such as learner.steps=1000.
+    /// One key to change, such as learner.steps=1000. May be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
 }

@@ -208,7 +208,7 @@ fn judge(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Arena) -> R
             match evaluate(p, arena, episodes, Streams::new(seed), true, interrupted) {
                 // One member that has diverged must not cost the others their result.
                 Err(Error::Sim(e @ SimError::NotFinite { .. })) => {
-                    eprintln!("seed {seed}: {e}; it has no score");
+                    tce_base::note!("seed {seed}: {e}; it has no score");
                     Ok(Evaluation::failed(e.to_string()))
                 }
                 judged => judged,

@@ -2,8 +2,6 @@
 
 use std::process::ExitCode;
 
-use clap::Parser;
-
 /// A training step allocates and frees megabytes of activations. The system's allocator gives them back to the kernel
 /// and takes them again, page fault by page fault: a fifth of the time of an IQL update.
 #[global_allocator]
@@ -21,10 +19,11 @@ fn keep_free_memory() {
 fn main() -> ExitCode {
     keep_free_memory();
     tce_base::listen_for_interrupts();
-    // clap itself answers a wrong call with exit code 2.
-    match tce::Cli::parse().run() {
+    match tce::Cli::of_command_line().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
+            // The line above the bars goes away before the error stands below them.
+            tce_base::end_course(false);
             let code = error.exit_code();
             eprintln!("{:?}", tce::report(error));
             ExitCode::from(code as u8)

@@ -15,6 +15,7 @@ use tce_sim::EPISODE_LIMIT;
 
 /// Options of every command that reads a user's own files.
 #[derive(Clone, Debug, Default, Args, Serialize)]
+#[command(next_help_heading = "Your own files")]
 pub struct Own {
     /// The robot is this one of the benchmark's (hopper-morph, ...): its terminal rule and its limit of 1000 steps apply, and policies are
     /// tried in its simulator. Without it, nothing is assumed of the robot: terminals are learned from the rows.
@@ -96,6 +97,7 @@ pub enum DataFormat {
 
 /// Options of commands that write a data set.
 #[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "What is written")]
 pub struct Writing {
     /// The layout of the written data set.
     #[arg(long, value_enum, default_value_t, value_name = "LAYOUT")]

@@ -148,11 +148,11 @@ pub fn run(
     };
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
     if let Some(summary) = stage.summary::<Summary>()? {
-        eprintln!("{name}: done before, in {}", stage.directory().display());
+        tce_base::note!("{name}: done before, in {}", stage.directory().display());
         return Ok(summary);
     }
     let started = Instant::now();
-    eprintln!("{name}: {}", stage.directory().display());
+    tce_base::note!("{name}: {}", stage.directory().display());
     let attempt = stage.attempt()?;
     write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
     let mut files = vec!["config.toml".to_owned()];
@@ -175,7 +175,7 @@ pub fn run(
     drop((tables, models));
 
     if let Some(choice) = inputs.choice(&config.target) {
-        eprintln!("{name}: {}", choice.reason);
+        tce_base::note!("{name}: {}", choice.reason);
     }
     // Who models the dynamics has no use for a terminal row without a successor.
     let target = match config.learner.algorithm.looks_at_successors() {
@@ -209,6 +209,7 @@ pub fn run(
     let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
     drop(extra);
     let place = (attempt.directory(), attempt.key());
+    tce_base::begin_step(&crate::course::learning(name));
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         save_policies(policies, seeds, attempt.directory(), inputs)?;
         files.extend(seeds.iter().map(|&seed| policy_file(seed)));

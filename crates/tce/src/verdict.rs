@@ -102,6 +102,7 @@ pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
 /// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
 pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]) -> Result<Verdict> {
     let judge = judge()?;
+    tce_base::begin_step("verdict");
     let try_all =
         |c: &Candidate| -> Result<Vec<Judged>> { c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect() };
     let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;

@@ -53,6 +53,6 @@ pub fn compiled(agent: Agent, shift: Shift) -> Result<Arc<MjModel>, SimError> {
 /// simulation that blows up) is reported row by row through [`crate::StepResult::unstable`].
 fn report(message: &MjLogMessage) {
     if message.level() == MjtLogLevel::mjLOG_ERROR {
-        eprintln!("MuJoCo: {}", message.subject());
+        tce_base::note!("MuJoCo: {}", message.subject());
     }
 }

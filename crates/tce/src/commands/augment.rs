@@ -8,6 +8,7 @@ use serde::Serialize;
 use tce_data::Transitions;
 use tce_nn::Device;
 
+use crate::course::Course;
 use crate::error::Result;
 use crate::expand::{Generated, expand};
 use crate::inputs::Inputs;
@@ -60,6 +61,10 @@ impl Augment {
         super::refuse_folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
+        let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
+        let mut course = Course::new(format!("{}x{}", dims.0, dims.1), 1, device, &self.cache);
+        course.generating(&config);
+        course.plan();
         let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;
         let report = expansion.reports[0].clone();
         let (generated, target) = (&inputs.in_own_units(&expansion.tables[0]), &inputs.target_in_own_units());

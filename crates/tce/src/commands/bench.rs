@@ -22,13 +22,13 @@ pub struct Bench {
     #[arg(value_parser = clap::builder::PossibleValuesParser::new(names()))]
     workloads: Vec<String>,
     /// Repeats of each; the table shows their median.
-    #[arg(long, default_value_t = 7)]
+    #[arg(long, default_value_t = 7, help_heading = "What is measured")]
     repeats: usize,
     /// Seconds a repeat takes.
-    #[arg(long, default_value_t = 0.5)]
+    #[arg(long, default_value_t = 0.5, help_heading = "What is measured")]
     seconds: f64,
     /// Seeds of IQL and of the learners on its networks (iql, iql-kl, dara ... rebrac); every member's update counts.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, help_heading = "What is measured")]
     seeds: u64,
     /// Write the results to this file as JSON, too.
     #[arg(long)]
@@ -76,7 +76,7 @@ impl Bench {
         let mut core_gflops = tce_nn::product_rate(0.1);
         let mut workloads = Vec::new();
         for name in names {
-            eprintln!("{name} ...");
+            tce_base::note!("{name} ...");
             workloads.push(measure(name, self.repeats, self.seconds, &on)?);
             core_gflops = core_gflops.max(tce_nn::product_rate(0.05));
         }

@@ -32,13 +32,13 @@ pub struct Collect {
     #[arg(long)]
     out: PathBuf,
     /// Take the mean action instead of a sampled one.
-    #[arg(long)]
+    #[arg(long, help_heading = "How rows are collected")]
     mean: bool,
     /// Environments in lockstep; each has its own episodes, so the rows depend on it.
-    #[arg(long, default_value_t = 32)]
+    #[arg(long, default_value_t = 32, help_heading = "How rows are collected")]
     lanes: usize,
     /// Seed of resets and actions.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, help_heading = "How rows are collected")]
     seed: u64,
     /// Replace an existing file.
     #[arg(long)]
@@ -88,7 +88,7 @@ impl Collect {
         save_d4rl(&self.out, &data, &attributes, &[])?;
         let content = tce_data::inspect(&data, Some(EPISODE_LIMIT));
         if content.complete_episodes == 0 {
-            eprintln!(
+            tce_base::note!(
                 "no episode came to its end: {} rows on {} lanes are {} steps each; for whole episodes take more rows or fewer --lanes",
                 self.rows,
                 self.lanes,

@@ -28,7 +28,7 @@ pub enum Data {
 /// Arguments of `inspect`.
 #[derive(Debug, Args)]
 pub struct Inspect {
-    /// HDF5 files in D4RL's or OTDF's layout.
+    /// Data sets: HDF5 files, or folders of Minari.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Show every dimension.
@@ -41,7 +41,7 @@ pub struct Inspect {
 /// Arguments of `check`.
 #[derive(Debug, Args)]
 pub struct CheckArgs {
-    /// HDF5 files in D4RL's or OTDF's layout.
+    /// Data sets: HDF5 files, or folders of Minari.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Simulate every transition and compare s', r and terminal.

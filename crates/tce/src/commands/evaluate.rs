@@ -12,7 +12,7 @@ use tce_sim::{Ending, Recording};
 
 use crate::actors::{Arena, Evaluation, evaluate, evaluate_recorded, load_policy};
 use crate::error::{Error, Result};
-use crate::output::{Output, mean_std, table};
+use crate::output::{Output, mark_best, mean_std, table};
 use crate::video::{Studio, VideoFile, parse_size, parse_video};
 
 /// Arguments of `evaluate`.
@@ -34,19 +34,19 @@ pub struct Evaluate {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Film the first episode, beside the first one in the source domain, into this .gif or .mp4 (which needs ffmpeg).
-    #[arg(long, value_name = "FILE", value_parser = parse_video)]
+    #[arg(long, value_name = "FILE", value_parser = parse_video, help_heading = "Film")]
     video: Option<VideoFile>,
     /// The film's longest duration, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = FilmOptions::default().seconds, requires = "video")]
+    #[arg(long, value_name = "SECONDS", default_value_t = FilmOptions::default().seconds, requires = "video", help_heading = "Film")]
     video_seconds: f64,
     /// Simulated seconds in one second of the film: 1 is real time.
-    #[arg(long, value_name = "FACTOR", default_value_t = FilmOptions::default().speed, requires = "video")]
+    #[arg(long, value_name = "FACTOR", default_value_t = FilmOptions::default().speed, requires = "video", help_heading = "Film")]
     video_speed: f64,
     /// Pixels of one panel.
-    #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "480x360", value_parser = parse_size, requires = "video")]
+    #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "480x360", value_parser = parse_size, requires = "video", help_heading = "Film")]
     video_size: [usize; 2],
     /// Replace an existing film.
-    #[arg(long, requires = "video")]
+    #[arg(long, requires = "video", help_heading = "Film")]
     force: bool,
 }
 
@@ -106,16 +106,20 @@ impl Evaluate {
             }
         }
         output.print(&all, |all| {
-            let rows = all.iter().map(|e| {
-                let (mean, std) = mean_std(&e.evaluation.returns);
-                [
-                    e.policy.display().to_string(),
-                    e.evaluation.returns.len().to_string(),
-                    format!("{mean:.1} ± {std:.1}"),
-                    format!("{:.0}", e.evaluation.mean_length()),
-                    e.evaluation.score.map_or("-".into(), |s| format!("{s:.1}")),
-                ]
-            });
+            let mut rows: Vec<_> = all
+                .iter()
+                .map(|e| {
+                    let (mean, std) = mean_std(&e.evaluation.returns);
+                    [
+                        e.policy.display().to_string(),
+                        e.evaluation.returns.len().to_string(),
+                        format!("{mean:.1} ± {std:.1}"),
+                        format!("{:.0}", e.evaluation.mean_length()),
+                        e.evaluation.score.map_or("-".into(), |s| format!("{s:.1}")),
+                    ]
+                })
+                .collect();
+            mark_best(rows.iter_mut().map(|row| &mut row[4]));
             table(&["policy", "episodes", "return", "length", "score"], rows)
         });
         Ok(())
@@ -170,7 +174,7 @@ impl Evaluate {
         if film.steps() < longest {
             note += &format!("; steps 0 to {} of {longest} (see --video-seconds, --video-speed)", film.steps());
         }
-        eprintln!("{note}");
+        tce_base::note!("{note}");
         let panels = film.recordings().map(Shown::of).collect();
         let (interval, stride) = (film.interval(), film.stride());
         let video = Some(Filmed { file, bytes, width, height, frames, interval, stride, panels });

@@ -11,13 +11,14 @@ use tce_nn::Device;
 
 use crate::actors::Arena;
 use crate::config::{Algorithm, Config, LearnerConfig};
+use crate::course::{Course, learning};
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, Table};
 use crate::judge::Judge;
 use crate::layers::ConfigArgs;
 use crate::learning::{Learned, MemberData, learn, save_policies};
 use crate::methods::{Method, row_scores};
-use crate::output::{Output, plus_minus, table};
+use crate::output::{Output, list as listed, plus_minus, table};
 use crate::own::Own;
 use crate::pipeline::seeds;
 use crate::processor::Processor;
@@ -36,22 +37,22 @@ pub struct Learn {
     #[arg(long, value_name = "FILE")]
     extra: Option<PathBuf>,
     /// The learner (default: the configuration's).
-    #[arg(long, value_enum, alias = "algorithm")]
+    #[arg(long, value_enum, alias = "algorithm", help_heading = "What is learned")]
     learner: Option<Algorithm>,
     /// bc: clone the best trajectories only, this share of them.
-    #[arg(long, value_name = "SHARE")]
+    #[arg(long, value_name = "SHARE", help_heading = "What is learned")]
     top: Option<f64>,
     /// Policies to learn; all of them are one training.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, help_heading = "What is learned")]
     seeds: usize,
     /// The first seed.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, help_heading = "What is learned")]
     seed: u64,
     /// The source's rows, to try the policies in learned dynamics of both robots. Without them the target's rows alone are known.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Verdict")]
     source: Option<PathBuf>,
     /// Do not learn a floor from the target rows alone, do not try the policies, and recommend none.
-    #[arg(long)]
+    #[arg(long, help_heading = "Verdict")]
     no_verdict: bool,
     /// Directory for policies and metrics.
     #[arg(long, required_unless_present = "list")]
@@ -61,6 +62,9 @@ pub struct Learn {
     #[command(flatten)]
     config: ConfigArgs,
 }
+
+/// What stands beside a policy that more than the target rows were used for.
+const FLOOR: &str = "cloning the target rows";
 
 #[derive(Serialize, Deserialize)]
 struct Report {
@@ -123,7 +127,7 @@ impl Learn {
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
         if let Some(report) = found(&out, &spec)? {
-            eprintln!("done before, in {}", out.display());
+            tce_base::note!("done before, in {}", out.display());
             output.print(&report, render);
             return Ok(());
         }
@@ -142,6 +146,8 @@ impl Learn {
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
         tce_base::write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), config.to_toml().as_bytes())?;
+        self.plan(&config, &inputs, seeds.len(), &out, device);
+        tce_base::begin_step(&learning(method.name));
         let mut files = Vec::new();
         let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
             files = save_policies(policies, &seeds, &out, &inputs)?;
@@ -169,6 +175,23 @@ impl Learn {
     }
 }
 
+impl Learn {
+    /// Tells the steps that are to come.
+    fn plan(&self, config: &Config, inputs: &Inputs, seeds: usize, out: &Path, device: &Device) {
+        let rows = &inputs.target.rows;
+        let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, out);
+        let mixed = inputs.extra.is_some();
+        course.learning(config.learner.algorithm.method().name, config, mixed);
+        if !self.no_verdict {
+            if mixed {
+                course.learning(FLOOR, &Config { learner: floor_learner(config), ..config.clone() }, false);
+            }
+            course.verdict(config);
+        }
+        course.plan();
+    }
+}
+
 /// What the target rows alone are good for: an ensemble of clones per seed, in `floor/`.
 fn floor(
     data: Vec<MemberData>,
@@ -178,14 +201,20 @@ fn floor(
     inputs: &Inputs,
     device: &Device,
 ) -> Result<Candidate> {
-    let learner = LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..config.learner.clone() };
+    let learner = floor_learner(config);
     let directory = out.join("floor");
+    tce_base::begin_step(&learning(FLOOR));
     let mut files = Vec::new();
     learn(data, &learner, &config.evaluation, None, (&directory, key), device, |policies| {
         files = save_policies(policies, seeds, &directory, inputs)?;
         Ok(())
     })?;
-    Ok(Candidate { name: "cloning the target rows".into(), floor: true, files })
+    Ok(Candidate { name: FLOOR.into(), floor: true, files })
+}
+
+/// The learner of the floor.
+fn floor_learner(config: &Config) -> LearnerConfig {
+    LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..config.learner.clone() }
 }
 
 /// What a learning of `spec` left in `out`, if it came to its end; None where it is to begin or to go on.
@@ -264,7 +293,8 @@ fn list(methods: &[Method; Algorithm::ALL.len()]) -> String {
         let modes = m.published.map_or_else(String::new, |what| format!("published: {what}"));
         [m.name, m.description, m.reference, m.needs].map(str::to_owned).into_iter().chain([modes]).collect::<Vec<_>>()
     });
-    let text = table(&["learner", "what it is", "reference", "besides target rows", "mode (default: corrected)"], rows);
+    let text =
+        listed(&["learner", "what it is", "reference", "besides target rows", "mode (default: corrected)"], rows);
     format!(
         "{text}\nSettings: learner.NAME, with _ for - (tce config show); a mode is chosen by --set learner.dara.mode=published"
     )

@@ -2,22 +2,25 @@
 
 use std::path::Path;
 
-use clap::{Parser, Subcommand};
+use clap::{FromArgMatches, Parser, Subcommand};
 use tce_base::{ensure_folder, ensure_writable};
 
 use crate::error::{Error, Result};
-use crate::output::Output;
+use crate::output::{Form, Output};
 use crate::processor::Processor;
 
 mod augment;
 mod bench;
 mod collect;
+mod completions;
 mod config;
 mod data;
 mod diagnose;
 mod evaluate;
+mod help;
 mod judge;
 mod learn;
+mod man;
 mod report;
 mod run;
 mod sweep;
@@ -30,16 +33,19 @@ mod zoo;
 #[command(name = "tce", version, propagate_version = true)]
 pub struct Cli {
     /// Print one JSON document instead of tables.
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = "Global options")]
     json: bool,
+    /// Print the rows of the JSON document as CSV instead of tables.
+    #[arg(long, global = true, conflicts_with = "json", help_heading = "Global options")]
+    csv: bool,
     /// Threads to use (default: all cores). The results do not depend on it.
-    #[arg(long, global = true, value_name = "N")]
+    #[arg(long, global = true, value_name = "N", help_heading = "Global options")]
     threads: Option<usize>,
-    /// Seconds between two checkpoints of a long stage. What a killed command loses, not what it computes, depends on it.
-    #[arg(long, global = true, value_name = "SECONDS", default_value_t = 60.0)]
+    /// Seconds between two checkpoints of a long stage. A killed command loses so much; the results do not depend on it.
+    #[arg(long, global = true, value_name = "SECONDS", default_value_t = 60.0, help_heading = "Global options")]
     save_every: f64,
     /// What computes the networks.
-    #[arg(long, global = true, value_enum, default_value_t)]
+    #[arg(long, global = true, value_enum, default_value_t, help_heading = "Global options")]
     device: Processor,
     #[command(subcommand)]
     command: Command,
@@ -47,41 +53,51 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// The whole pipeline on a benchmark task: data, augmentation, policy, evaluation, floors.
+    /// Do the whole job on a benchmark task: collect data, widen them, learn policies and compare them with simple ones.
     Run(run::Run),
     /// Widen a target data set of your own with the help of a source data set; no simulator needed.
     Augment(augment::Augment),
     /// Learn a policy from data sets.
     Learn(learn::Learn),
-    /// Roll a policy out and report its returns.
+    /// Try policies in the simulator: returns, scores, films.
     Evaluate(evaluate::Evaluate),
     /// Compare policies by the two data sets alone, in learned dynamics; no simulator needed.
     Judge(judge::JudgeArgs),
-    /// Train agents by soft actor-critic in the simulator: actors for data of any quality.
+    /// Train actors by soft actor-critic in the simulator, for data of any quality.
     TrainSac(train_sac::TrainSac),
-    /// The actors that come with the program.
+    /// Look at and try the actors that come with the program.
     #[command(subcommand)]
     Zoo(zoo::Zoo),
-    /// Roll trained actors out into a data set.
+    /// Collect a data set by trained actors.
     Collect(collect::Collect),
     /// Look at, check and convert data sets.
     #[command(subcommand)]
     Data(data::Data),
-    /// Show the configuration and where every value comes from.
+    /// Show and explain every setting, its value, and where the value comes from.
     #[command(subcommand)]
     Config(config::Config),
-    /// Measure what a stage of the pipeline does.
+    /// Measure how good generated rows are.
     Diagnose(Box<diagnose::Diagnose>),
-    /// Many runs: planned once, done on one machine or on Slurm, gathered into a table.
+    /// Plan many runs, do them on one machine or on Slurm, and gather them into a table.
     #[command(subcommand)]
     Sweep(sweep::SweepCommand),
-    /// Statistics, tables beside the paper's, and a page that shows them, of a sweep or of a folder of runs.
+    /// Make a page of a sweep or a folder of runs: statistics, figures, tables beside the paper's.
     Report(report::Report),
-    /// Measure how fast the program's hot loops run on this machine.
+    /// Measure how fast the program runs on this machine.
     Bench(bench::Bench),
+    /// Print a script with which a shell completes commands and options.
+    Completions(completions::Completions),
+    /// Write the manual pages.
+    Man(man::Man),
 }
 
 impl Cli {
+    /// What the user asked for. Help, versions and wrong calls end the process here, by clap's own hand: a wrong call with exit code 2.
+    pub fn of_command_line() -> Self {
+        let matches = help::command().get_matches();
+        Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+    }
+
     /// Runs the command.
     pub fn run(self) -> Result<()> {
         if let Some(threads) = self.threads {
@@ -97,7 +113,12 @@ impl Cli {
         tce_nn::set_checkpoint_seconds(self.save_every);
         // Opened by the commands that compute networks; the others need none.
         let device = || self.device.device();
-        let output = Output { json: self.json };
+        let form = match (self.json, self.csv) {
+            (true, _) => Form::Json,
+            (false, true) => Form::Csv,
+            _ => Form::Text,
+        };
+        let output = Output { form };
         match self.command {
             Command::Run(args) => args.run(output, &device()?),
             Command::Augment(args) => args.run(output, &device()?),
@@ -113,6 +134,8 @@ impl Cli {
             Command::Sweep(command) => command.run(output, self.save_every, self.device),
             Command::Report(args) => args.run(output),
             Command::Bench(args) => args.run(output, self.device, &device()?),
+            Command::Completions(args) => args.run(),
+            Command::Man(args) => args.run(),
         }
     }
 }

@@ -7,12 +7,13 @@ use tce_learn::{DynamicsConfig, LabelErrors};
 use tce_nn::Device;
 
 use crate::conclusion::{self, Scored};
-use crate::config::Algorithm;
+use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
+use crate::course::Course;
 use crate::error::{Error, Result};
 use crate::inputs::{Behaviour, DataArgs, Inputs};
 use crate::judge::Judge;
 use crate::layers::ConfigArgs;
-use crate::output::{Output, plus_minus, table};
+use crate::output::{Output, heading, mark_best, plus_minus, table};
 use crate::pipeline::{Summary, run, seeds};
 use crate::variant::Variant;
 use crate::verdict::{Candidate, Kept, keep, only, recommend};
@@ -23,25 +24,25 @@ pub struct Run {
     /// The task: ROBOT-SHIFT/SOURCE/TARGET, as in hopper-morph/medium/expert.
     task: Task,
     /// The methods, separated by commas.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "tce-og")]
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "tce-og", help_heading = "What is learned")]
     variant: Vec<Variant>,
     /// How many seeds; all of them are one training.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, help_heading = "What is learned")]
     seeds: usize,
     /// The first seed.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, help_heading = "What is learned")]
     seed: u64,
     #[command(flatten)]
     data: DataArgs,
     /// Leave out the floors (cloning with raw and with standardised observations, cloning of the best half, IQL on the target
     /// alone).
-    #[arg(long)]
+    #[arg(long, help_heading = "What stands beside it")]
     no_floors: bool,
     /// Do not try the policies in learned dynamics, and recommend none.
-    #[arg(long)]
+    #[arg(long, help_heading = "What stands beside it")]
     no_verdict: bool,
     /// Another learner for the methods, not for the floors (`tce learn --list`).
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, help_heading = "What is learned")]
     learner: Option<Algorithm>,
     #[command(flatten)]
     config: ConfigArgs,
@@ -97,6 +98,8 @@ impl Run {
         super::refuse_folder(&self.data.out)?;
         // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
         let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);
+        self.plan(&variants, &configs, seeds.len(), device);
+        tce_base::begin_step("data");
         let inputs = Inputs::of_config(self.task, &self.data, widest)?;
         let mut rows = Vec::new();
         for ((variant, floor), config) in variants.into_iter().zip(&configs) {
@@ -123,6 +126,21 @@ impl Run {
 }
 
 impl Run {
+    /// Tells the steps that are to come.
+    fn plan(&self, variants: &[(Variant, bool)], configs: &[Config], seeds: usize, device: &Device) {
+        let mut course = Course::new(self.task.agent, seeds, device, &self.data.out);
+        course.step("data", serde_json::json!(self.task));
+        for ((variant, _), config) in variants.iter().zip(configs) {
+            let mixed = config.mixture.generated != GeneratedRows::None || config.mixture.source != SourceRows::None;
+            course.generating(config);
+            course.learning(&variant.name(), config, mixed);
+        }
+        if !self.no_verdict {
+            course.verdict(&configs[0]);
+        }
+        course.plan();
+    }
+
     /// Recommends one of the policies of `rows`, and puts it beside the runs.
     fn verdict(&self, inputs: &Inputs, rows: &[Row], dynamics: &DynamicsConfig, device: &Device) -> Result<Kept> {
         let candidate =
@@ -163,11 +181,14 @@ fn render(report: &Report) -> String {
         let figures = [score, format!("{:.1} ± {:.1}", b.mean, b.std), "-".into(), b.rows.to_string(), "-".into()];
         std::iter::once(title.to_owned()).chain(figures).collect::<Vec<_>>()
     };
+    let mut lines: Vec<_> = lines.collect();
+    mark_best(lines.iter_mut().map(|line| &mut line[1]));
     let lines = lines
+        .into_iter()
         .chain(report.source.iter().map(|b| behaviour("source behaviour", b)))
         .chain([behaviour("target behaviour", &report.target)]);
     let header = ["method", "score", "return", "seeds", "other rows", "time"];
-    let mut text = format!("{}\n{}\n", report.task, table(&header, lines));
+    let mut text = format!("{}\n{}\n", heading(&report.task.to_string()), table(&header, lines));
     let generated = report.rows.iter().filter(|r| !r.summary.generated.is_empty()).map(|r| {
         let mean = |f: &dyn Fn(&crate::expand::Generated) -> f64| {
             r.summary.generated.iter().map(f).sum::<f64>() / r.summary.generated.len() as f64

@@ -10,7 +10,7 @@ use tce_base::interrupted;
 use tce_nn::Device;
 
 use crate::error::{Error, Result};
-use crate::output::{Output, table};
+use crate::output::{Output, fit, table};
 use crate::processor::Processor;
 use crate::sweep::local::Share;
 use crate::sweep::slurm::{Array, Submission};
@@ -62,22 +62,22 @@ pub struct Launch {
     #[arg(long, value_enum, default_value = "local")]
     launcher: Launcher,
     /// local: processes at a time (default: one a core).
-    #[arg(long)]
+    #[arg(long, help_heading = "On this machine")]
     workers: Option<usize>,
     /// Threads of each process.
     #[arg(long, default_value_t = 1)]
     threads_each: usize,
     /// local: how often work is tried again after a failure.
-    #[arg(long, default_value_t = 2)]
+    #[arg(long, default_value_t = 2, help_heading = "On this machine")]
     retries: usize,
     /// slurm: pieces of work in one array element, one after the other; for work of less than a minute.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, help_heading = "On Slurm")]
     pack: usize,
     /// slurm: seconds before the time limit at which the work writes its checkpoint and asks for another turn.
-    #[arg(long, default_value_t = 120)]
+    #[arg(long, default_value_t = 120, help_heading = "On Slurm")]
     grace: u32,
     /// slurm: an argument for sbatch, such as --sbatch=--time=04:00:00; may be given several times.
-    #[arg(long, value_name = "ARGUMENT", allow_hyphen_values = true)]
+    #[arg(long, value_name = "ARGUMENT", allow_hyphen_values = true, help_heading = "On Slurm")]
     sbatch: Vec<String>,
     /// Read every file of what is done, and do again what was changed since. Work whose files are gone is done again in any case.
     #[arg(long)]
@@ -194,7 +194,7 @@ impl Launch {
         let sweep = Sweep::open(&self.directory)?;
         if !self.dry_run {
             for what in sweep.take_back_damaged(self.verify)? {
-                eprintln!("to be done again: {what}");
+                tce_base::note!("to be done again: {what}");
             }
         }
         match self.launcher {
@@ -260,7 +260,7 @@ impl RunOne {
                 // The work's own checkpoint is written; the rest of the list comes in the next turn.
                 Err(e) if e.exit_code() == 130 => return Err(e),
                 Err(e) => {
-                    eprintln!("{}: {e}", sweep.entries()[index]);
+                    tce_base::note!("{}: {e}", sweep.entries()[index]);
                     failed = Some(e);
                 }
             }
@@ -293,7 +293,7 @@ impl StatusArgs {
             let mut out = std::io::stdout().lock();
             // On a terminal the next look takes the place of the last one.
             let clear = if out.is_terminal() { "\x1b[H\x1b[2J" } else { "" };
-            let _ = write!(out, "{clear}{}", status.render()).and_then(|()| out.flush());
+            let _ = writeln!(out, "{clear}{}", fit(&status.render())).and_then(|()| out.flush());
             drop(out);
             if status.complete() || status.stuck() {
                 return status.healthy();

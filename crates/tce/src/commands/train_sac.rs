@@ -26,10 +26,10 @@ pub struct TrainSac {
     #[arg(long, default_value_t = 1_000_000)]
     steps: u64,
     /// End at the first evaluation with this normalised score.
-    #[arg(long)]
+    #[arg(long, help_heading = "What is kept, and when it ends")]
     until_score: Option<f64>,
     /// Keep the policy of the first evaluation at each of these scores.
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, help_heading = "What is kept, and when it ends")]
     snapshot_scores: Vec<f64>,
     /// Trainings per environment, with seeds from --seed on.
     #[arg(long, default_value_t = 1)]
@@ -42,10 +42,10 @@ pub struct TrainSac {
     out: PathBuf,
     /// Begin with networks of the same robot in another domain: the directory of a training, or a policy (its file, or
     /// zoo:NAME).
-    #[arg(long)]
+    #[arg(long, help_heading = "Training")]
     from: Option<PathBuf>,
     /// Updates of the critics alone, before the policy's first.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, help_heading = "Training")]
     policy_start: u64,
     /// With --from: share of uniformly random actions until the policy's first update. They tell the critics what other actions do.
     #[arg(long, default_value_t = 0.0)]
@@ -54,7 +54,7 @@ pub struct TrainSac {
     #[arg(long)]
     critic_norm: bool,
     /// The temperature α before the first update. A trained policy wants less than a new one.
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, help_heading = "Training")]
     temperature: f64,
     /// The entropy that α keeps the policy at (default: minus the number of actions). A trained policy has less, and loses its
     /// gait where it has to gain it back.
@@ -64,25 +64,25 @@ pub struct TrainSac {
     #[arg(long)]
     policy_lr: Option<f64>,
     /// Steps before the first update: uniformly random, or the policy's of --from.
-    #[arg(long, default_value_t = 10_000)]
+    #[arg(long, default_value_t = 10_000, help_heading = "Training")]
     start: u64,
     /// Environment steps per update.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, help_heading = "Training")]
     steps_per_update: u64,
     /// Rows per update.
-    #[arg(long, default_value_t = 256)]
+    #[arg(long, default_value_t = 256, help_heading = "Training")]
     batch: usize,
     /// Steps between evaluations.
-    #[arg(long, default_value_t = 10_000)]
+    #[arg(long, default_value_t = 10_000, help_heading = "Evaluation")]
     evaluate_every: u64,
     /// Episodes of an evaluation, with sampled actions.
-    #[arg(long, default_value_t = 20)]
+    #[arg(long, default_value_t = 20, help_heading = "Evaluation")]
     episodes: usize,
     /// Steps between checkpoints.
-    #[arg(long, default_value_t = 50_000)]
+    #[arg(long, default_value_t = 50_000, help_heading = "What is kept, and when it ends")]
     checkpoint_every: u64,
     /// At the end, write the replay buffers into the trainings' directories, in D4RL's layout (medium-replay).
-    #[arg(long)]
+    #[arg(long, help_heading = "What is kept, and when it ends")]
     replay: bool,
 }
 

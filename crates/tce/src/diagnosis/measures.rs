@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use rand::seq::SliceRandom;
-use tce_base::Streams;
 use tce_base::random::choose;
+use tce_base::{Streams, begin_step};
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
@@ -27,6 +27,9 @@ use crate::units::Units;
 
 /// Reference states of each domain behind a coverage.
 const REFERENCE: usize = 2000;
+/// The steps of a diagnosis, after those of the run.
+pub const PARTS: [&str; 5] =
+    ["rows to measure", "transition models", "coverage and reliability", "choice of λ", "pictures and implied policy"];
 /// Points of each group in a picture.
 const POINTS: usize = 400;
 /// Source rows behind Theorem 1.
@@ -98,6 +101,7 @@ impl Work<'_> {
         grid.extend([0.0, config.generator.y_max]);
         grid.sort_by(f32::total_cmp);
         grid.dedup();
+        begin_step(PARTS[0]);
         let batches = grid.iter().map(|&y| sampler.sample(options.rows, y, "figures")).collect::<Result<Vec<_>>>()?;
         let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
         let own = &batches[at(config.generator.y_max)];
@@ -110,6 +114,7 @@ impl Work<'_> {
             ));
         }
         let sources = self.sources(&streams)?;
+        begin_step(PARTS[1]);
         let models = Models::train(self, sources.as_ref(), own, *grid.last().expect("a grid"), attempt, device)?;
         if self.simulator.is_none() {
             let why =
@@ -119,6 +124,7 @@ impl Work<'_> {
                  and Theorem 1 by models of the target rows alone."
             ));
         }
+        begin_step(PARTS[2]);
         // As many as every bound has, but for those of which the filter leaves next to nothing.
         let kept = batches.iter().map(Batch::kept).filter(|k| 2 * k >= own.kept()).min().expect("the run's own");
         let references = self.references(&streams, sources.as_ref(), kept)?;
@@ -159,11 +165,13 @@ impl Work<'_> {
                 outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
             });
         }
+        begin_step(PARTS[3]);
         let theorem = sources.as_ref().map(|s| self.theorem(s, own, &models, &streams)).transpose()?;
         if theorem.is_none() {
             notes.push("Without source rows there is no λ to choose.".into());
         }
         notes.extend(left_out(own, theorem.as_ref(), self.simulator.is_some()));
+        begin_step(PARTS[4]);
         let mut states = Vec::new();
         for y in [0.0, config.generator.y_max, *grid.last().expect("a grid")] {
             if states.iter().all(|(other, _)| *other != decimal(y)) {

@@ -16,6 +16,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 use tce_base::write_json;
 use tce_data::Task;
 use tce_diagnosis::Diagnosis;
@@ -23,6 +24,7 @@ use tce_learn::TransitionConfig;
 use tce_nn::Device;
 
 use crate::config::{Config, GeneratedRows};
+use crate::course::Course;
 use crate::error::{Error, Result};
 use crate::expand::{Finisher, label_models};
 use crate::generator::Generator;
@@ -164,6 +166,17 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     if stage.summary::<serde_json::Value>()?.is_some() {
         return Ok((read(&stage.file(&file))?, stage.directory().to_owned()));
     }
+    let mut course = Course::new(
+        format!("{}x{}", inputs.target.rows.obs_dim, inputs.target.rows.act_dim),
+        seeds.len(),
+        device,
+        root,
+    );
+    course.generating(config);
+    for part in measures::PARTS {
+        course.step(part, json!([options, inputs.target.rows.len()]));
+    }
+    course.plan();
     let (generator, ..) = Generator::train(inputs, config, seeds, root, device)?;
     let (models, _, errors) = label_models(inputs, &config.labels, seeds, root, device)?;
     let finisher = Finisher::new(&generator.units, &models, config, inputs);

@@ -11,7 +11,7 @@ use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
 use crate::conclusion::{Scored, Tally};
 use crate::error::{Error, Result};
-use crate::output::{plus_minus, table};
+use crate::output::{mark_best, plus_minus, table};
 use crate::variant::Variant;
 
 /// One finished run.
@@ -170,7 +170,9 @@ impl Gathered {
         let header: Vec<&str> = std::iter::once("task").chain(methods.iter().copied()).collect();
         let rows = tasks.iter().map(|task| {
             let cell = |method: &&str| cells.get(&(*task, *method)).map_or("-".into(), |s| plus_minus(s));
-            std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect::<Vec<_>>()
+            let mut cells: Vec<_> = std::iter::once((*task).to_owned()).chain(methods.iter().map(cell)).collect();
+            mark_best(cells.iter_mut().skip(1));
+            cells
         });
         let mut text = table(&header, rows);
         for sentence in self.sentences(&tasks, &methods, &cells) {

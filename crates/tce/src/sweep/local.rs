@@ -4,13 +4,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
-use tce_base::{FileError, Progress, interrupted};
+use tce_base::{FileError, Headline, Progress, format::about, interrupted};
 
 use super::{Entry, Sweep};
 use crate::error::{Error, Result};
 use crate::processor::Processor;
+
+/// Time between two looks at how long the rest takes.
+const LOOK: Duration = Duration::from_secs(3);
 
 /// How to share the machine.
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +39,11 @@ impl Sweep {
     /// If a process cannot be started, or the user interrupts; the processes are then given the time to write their checkpoints.
     pub fn launch_here(&self, share: Share) -> Result<usize> {
         let mut todo: BTreeSet<usize> = self.missing()?.iter().map(|e| e.index).collect();
+        let headline = Arc::new(Mutex::new(String::new()));
+        let shown = headline.clone();
+        let _line = Headline::drawn_by(move || shown.lock().unwrap_or_else(PoisonError::into_inner).clone());
+        let all = todo.len();
+        let mut looked: Option<Instant> = None;
         let progress = Progress::new("sweep", todo.len() as u64, "pieces of work");
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
         // The last message of each piece: one that fails twice in the same words fails a third time, too.
@@ -53,6 +62,13 @@ impl Sweep {
                 let Some(&next) = todo.iter().find(ready) else { break };
                 todo.remove(&next);
                 running.insert(next, self.start(&self.entries()[next], share)?);
+            }
+            // Every record is read for it, so not at every turn.
+            if looked.is_none_or(|at| at.elapsed() > LOOK) {
+                let left = self.status().ok().and_then(|s| s.seconds_left);
+                let text = headline_of(all - todo.len() - running.len(), running.len(), all, left);
+                *headline.lock().unwrap_or_else(PoisonError::into_inner) = text;
+                looked = Some(Instant::now());
             }
             std::thread::sleep(Duration::from_millis(50));
             let mut ended = Vec::new();
@@ -78,8 +94,8 @@ impl Sweep {
                 let told =
                     messages.iter().any(|(i, m)| *i != index && *m == reason) || before.as_ref() == Some(&reason);
                 match told {
-                    false => eprintln!("{entry}: failed: {reason}; its log: {}", self.log(entry).display()),
-                    true => eprintln!("{entry}: failed, with the same message"),
+                    false => tce_base::note!("{entry}: failed: {reason}; its log: {}", self.log(entry).display()),
+                    true => tce_base::note!("{entry}: failed, with the same message"),
                 }
                 // A process that was killed has no words, and is tried as often as was said.
                 let again = words.is_none() || before != words;
@@ -118,9 +134,19 @@ impl Sweep {
     }
 }
 
+/// What is under way of all pieces of work, and how long the rest takes, where that is known.
+fn headline_of(done: usize, running: usize, all: usize, left: Option<f64>) -> String {
+    let pieces = match running {
+        0 | 1 => format!("piece {}", (done + running).max(1)),
+        n => format!("pieces {} to {}", done + 1, done + n),
+    };
+    let left = left.map_or_else(String::new, |s| format!(", {} left", about(s)));
+    format!("{pieces} of {all}{left}")
+}
+
 /// Asks the processes to stop at their next safe point, and waits for them.
 fn stop(running: BTreeMap<usize, Child>) -> Error {
-    eprintln!("stopping {} processes at their next checkpoint ...", running.len());
+    tce_base::note!("stopping {} processes at their next checkpoint ...", running.len());
     for child in running.values() {
         terminate(child);
     }
@@ -138,3 +164,14 @@ fn terminate(child: &Child) {
 
 #[cfg(not(unix))]
 fn terminate(_: &Child) {}
+
+#[cfg(test)]
+mod tests {
+    use super::headline_of;
+
+    #[test]
+    fn the_line_above_the_bar_tells_pieces_and_time() {
+        assert_eq!(headline_of(4, 1, 12, Some(240.0)), "piece 5 of 12, about 4 min left");
+        assert_eq!(headline_of(4, 2, 12, None), "pieces 5 to 6 of 12");
+    }
+}

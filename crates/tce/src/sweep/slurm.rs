@@ -126,7 +126,7 @@ impl Sweep {
         let queued = match self.queued() {
             Ok(queued) => queued,
             Err(e) => {
-                eprintln!(
+                tce_base::note!(
                     "{e}; what is in the queue is not known, and may be submitted a second time, which is harmless"
                 );
                 BTreeSet::new()
@@ -217,7 +217,9 @@ impl Sweep {
             // A controller that lost its memory gives numbers out twice; the node refuses the second job of a number, and Slurm
             // holds it for ever. Whoever held a job by hand has a reason of his own, which is another word.
             if reason.contains("requeued held") || reason.contains("requeued in held") {
-                eprintln!("job {job}_{element} is held ({reason}): it is cancelled, and its work submitted again");
+                tce_base::note!(
+                    "job {job}_{element} is held ({reason}): it is cancelled, and its work submitted again"
+                );
                 let _ = call("scancel", &[format!("{job}_{element}")]);
                 continue;
             }

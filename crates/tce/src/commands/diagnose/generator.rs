@@ -175,7 +175,7 @@ impl GeneratorArgs {
                     self.rows,
                     self.seed,
                 )?;
-                eprintln!(
+                tce_base::note!(
                     "{} {}: SW to held-out states {:.3}, consistency {:.3}",
                     process_name(&process),
                     sampler_name(sampler),
@@ -202,7 +202,8 @@ impl GeneratorArgs {
         let config = self.config.layered(Some(self.task), Some(Variant::TceOg))?.config()?;
         let inputs = Inputs::of_config(self.task, &self.data, &config)?;
         let place = (self.task.agent, self.task.shift);
-        let said = |n: &AtCycle| eprintln!("{}: action RMSE {}, score {}", n.cells()[0], n.cells()[4], n.cells()[10]);
+        let said =
+            |n: &AtCycle| tce_base::note!("{}: action RMSE {}, score {}", n.cells()[0], n.cells()[4], n.cells()[10]);
         let sizes = (self.rows, self.episodes);
         let cycles = cycles(&inputs, &config, place, self.seed, sizes, &self.data.out, device, said)?;
         output.print(&CyclesReport { task: self.task, episodes: self.episodes, cycles }, render_cycles);

@@ -52,13 +52,13 @@ struct RunArgs {
     #[arg(value_name = "RUN", required_unless_present = "target")]
     run: Option<PathBuf>,
     /// Source data: of the run, where its own is not found; or your own.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Data")]
     source: Option<PathBuf>,
     /// Target data: of the run, where its own is not found; or your own.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help_heading = "Data")]
     target: Option<PathBuf>,
     /// The run's data were collected with --from-zoo.
-    #[arg(long)]
+    #[arg(long, help_heading = "Data")]
     from_zoo: bool,
     /// Where stages are kept (default: the run's own folder, or runs).
     #[arg(long)]
@@ -67,25 +67,25 @@ struct RunArgs {
     #[arg(long)]
     seed: Option<u64>,
     /// Rows behind every figure.
-    #[arg(long, default_value_t = Options::default().rows)]
+    #[arg(long, default_value_t = Options::default().rows, help_heading = "What is measured")]
     rows: usize,
     /// Label bounds, separated by commas; 0 and the run's own are among them in any case.
-    #[arg(long, value_delimiter = ',', default_values_t = Options::default().y_max)]
+    #[arg(long, value_delimiter = ',', default_values_t = Options::default().y_max, help_heading = "What is measured")]
     y_max: Vec<f32>,
     /// Use no simulator, as for a robot of your own.
-    #[arg(long)]
+    #[arg(long, help_heading = "What is measured")]
     no_simulator: bool,
     /// Updates of the transition models.
-    #[arg(long, default_value_t = Options::default().transition.steps)]
+    #[arg(long, default_value_t = Options::default().transition.steps, help_heading = "What is measured")]
     transition_steps: u64,
     /// Updates of the value function.
-    #[arg(long, default_value_t = Options::default().value_steps)]
+    #[arg(long, default_value_t = Options::default().value_steps, help_heading = "What is measured")]
     value_steps: u64,
     /// Abundant target rows to simulate.
-    #[arg(long, default_value_t = Options::default().abundant)]
+    #[arg(long, default_value_t = Options::default().abundant, help_heading = "What is measured")]
     abundant: usize,
     /// Episodes of the policy that the generator implies, in the simulator.
-    #[arg(long, default_value_t = Options::default().episodes)]
+    #[arg(long, default_value_t = Options::default().episodes, help_heading = "What is measured")]
     episodes: usize,
     #[command(flatten)]
     own: Own,

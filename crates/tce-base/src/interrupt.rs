@@ -1,0 +1,32 @@
+//! The wish to stop.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
+use signal_hook::iterator::Signals;
+
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// From now on SIGINT, SIGTERM and SIGUSR1 (a batch system's warning before its time limit) set a flag that long work looks at
+/// ([`interrupted`]). A SIGINT or SIGTERM more than a second later ends the process.
+pub fn listen_for_interrupts() {
+    let Ok(mut signals) = Signals::new([SIGINT, SIGTERM, SIGUSR1]) else { return };
+    let listen = move || {
+        let mut first = None;
+        for signal in signals.forever() {
+            // One wish to stop is often two signals at once: `timeout` sends one to the process and one to its group.
+            let patience = first.get_or_insert_with(Instant::now).elapsed();
+            if signal != SIGUSR1 && patience > Duration::from_secs(1) {
+                signal_hook::low_level::exit(130);
+            }
+            INTERRUPTED.store(true, Ordering::Relaxed);
+        }
+    };
+    let _ = std::thread::Builder::new().name("signals".into()).spawn(listen);
+}
+
+/// Whether the user asked to stop. Long loops ask once per step and leave at the next safe point.
+pub fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}

@@ -1,0 +1,88 @@
+//! What a command prints: a table for people, JSON or CSV for programs.
+
+use std::io::IsTerminal;
+
+use serde::Serialize;
+
+mod csv;
+mod table;
+mod wrap;
+
+pub use table::{heading, list, mark_best, table};
+pub use wrap::break_line;
+
+/// The form of the results.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// Tables and sentences.
+    Text,
+    /// One JSON document.
+    Json,
+    /// The rows of the JSON document, see [`csv`].
+    Csv,
+}
+
+/// Where and how results are printed. Progress and notes go to stderr, results to stdout.
+#[derive(Clone, Copy, Debug)]
+pub struct Output {
+    /// In which form.
+    pub form: Form,
+}
+
+impl Output {
+    /// Prints `value` as JSON or CSV, or what `render` makes of it.
+    pub fn print<T: Serialize>(&self, value: &T, render: impl FnOnce(&T) -> String) {
+        use std::io::Write;
+        // The command is at its end, and so are its steps.
+        tce_base::end_course(true);
+        let text = match self.form {
+            Form::Json => serde_json::to_string_pretty(value).expect("results are plain data"),
+            Form::Csv => csv::of(&serde_json::to_string(value).expect("results are plain data")),
+            Form::Text => fit(&render(value)),
+        };
+        // A closed pipe (`tce ... | head`) is not an error of the command.
+        let _ = writeln!(std::io::stdout(), "{}", text.trim_end());
+    }
+}
+
+/// `text` with lines no longer than they may be.
+pub fn fit(text: &str) -> String {
+    width().map_or_else(|| text.to_owned(), |width| wrap::text(text, width))
+}
+
+/// The columns that a line may have: `COLUMNS`, else the terminal's; None where results go to a file or a pipe, whose lines may be as long
+/// as they are.
+pub fn width() -> Option<usize> {
+    let told = std::env::var("COLUMNS").ok().and_then(|c| c.parse().ok()).filter(|c| *c >= 20);
+    let terminal = || {
+        let terminal = std::io::stdout().is_terminal().then(console::Term::stdout)?;
+        terminal.size_checked().map(|(_, columns)| usize::from(columns))
+    };
+    told.or_else(terminal)
+}
+
+/// Mean and sample standard deviation.
+pub fn mean_std(values: &[f64]) -> (f64, f64) {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n.max(1.0);
+    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+    (mean, variance.sqrt())
+}
+
+/// `61.7 ± 4.2`, or without the spread for one value.
+pub fn plus_minus(values: &[f64]) -> String {
+    let (mean, std) = mean_std(values);
+    if values.len() > 1 { format!("{mean:.1} ± {std:.1}") } else { format!("{mean:.1}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spreads_are_those_of_a_sample() {
+        assert_eq!(mean_std(&[1.0, 2.0, 3.0]), (2.0, 1.0));
+        assert_eq!(plus_minus(&[1.0, 2.0, 3.0]), "2.0 ± 1.0");
+        assert_eq!(plus_minus(&[61.7]), "61.7");
+    }
+}
