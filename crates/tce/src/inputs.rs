@@ -103,7 +103,7 @@ impl Table {
     fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
         let options = LoadOptions { all_columns: true, ..options.clone() };
         let Loaded { transitions, report, columns } = load(path, &options)?;
-        eprintln!("{report}");
+        tce_base::note!("{report}");
         let hash = sha256_file(&main_file(path))?;
         let bits = |t: &Transitions, i: usize| -> Vec<u32> {
             let parts = [t.observation(i), t.action(i), t.next_observation(i)];
@@ -126,7 +126,7 @@ impl Table {
             )));
         }
         let left_out = transitions.len() - others.len();
-        eprintln!(
+        tce_base::note!(
             "{}: {left_out} of its {} rows are target rows and are left out, for --target brings them",
             path.display(),
             transitions.len()
@@ -419,7 +419,7 @@ impl Inputs {
         }
         let (many, few) = (source.complete().len(), self.target.complete().len());
         if many < few {
-            eprintln!(
+            tce_base::note!(
                 "warning: the source ({}) has {many} rows, fewer than the target ({}) with {few}; are the two mixed up?",
                 source.file.display(),
                 self.target.file.display()
