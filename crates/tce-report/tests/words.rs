@@ -181,10 +181,24 @@ fn the_words_of_the_pages_are_explained() {
     let analysis = with_recipe(&mut study, &Recipe { learner, ..Recipe::default() });
     let report = tce_report::html::page(&study, &analysis);
     let alone = tce_report::diagnosis_page(&diagnosis(None));
-    let diagnosed =
-        ["y", "coverage", "lambda", "theorem", "generated", "source", "filter", "consistency", "implied", "tsne"];
+    let diagnosed = [
+        "y",
+        "coverage",
+        "lambda",
+        "theorem",
+        "generated",
+        "source",
+        "filter",
+        "consistency",
+        "implied",
+        "tsne",
+        "kl",
+        "rms",
+        "inverse",
+    ];
     let scored = [
         "score",
+        "bc",
         "baseline",
         "iqm",
         "seed",

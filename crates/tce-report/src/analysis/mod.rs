@@ -418,6 +418,6 @@ fn shift_table(
             figures.fold((0.0, 0), |(sum, n), p| (sum + p.mean, n + 1))
         })
         .collect();
-    let doubt = recipes::doubt(study, shift, &against);
+    let doubt = recipes::doubt(study, shift);
     Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against, doubt })
 }

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use tce_data::Shift;
 
-use super::{Against, ENOUGH_SEEDS};
+use super::ENOUGH_SEEDS;
+use crate::paper;
 use crate::study::{Budget, Recipe, Run, Study};
 
 /// Presets and learner updates of all runs.
@@ -83,31 +84,45 @@ fn budgets<'a>(all: impl Iterator<Item = &'a Budget>) -> Option<String> {
     (!texts.is_empty()).then(|| texts.join(" or "))
 }
 
-/// Why the figures of a shift are not to be compared with the paper's as they stand: what differs, by method. None where every run has
-/// the paper's settings and as many seeds.
-pub fn doubt(study: &Study, shift: Shift, against: &[Against]) -> Option<String> {
-    let mut parts = Vec::new();
-    for a in against {
-        let method = &study.methods[a.method];
+/// `a`, `a and b`, `a, b and c`.
+fn joined(names: &[&str]) -> String {
+    match names {
+        [rest @ .., last] if !rest.is_empty() => format!("{} and {last}", rest.join(", ")),
+        _ => names.concat(),
+    }
+}
+
+/// Why the figures of a shift are not to be compared with the paper's as they stand: what differs, by method. None where every run of a
+/// method of the paper's has the paper's settings, and as many seeds.
+pub fn doubt(study: &Study, shift: Shift) -> Option<String> {
+    paper::table(shift)?;
+    // Methods that differ in the same way share a sentence.
+    let mut parts: Vec<(String, Vec<&str>)> = Vec::new();
+    for method in study.methods.iter().filter(|m| paper::counterpart(&m.variant).is_some()) {
         let runs: Vec<&Run> = study.runs.iter().filter(|r| r.task.shift == shift && r.method == method.id).collect();
         let mut by_task: BTreeMap<_, usize> = BTreeMap::new();
         runs.iter().for_each(|r| *by_task.entry(r.task.to_string()).or_default() += 1);
-        let fewest = by_task.values().min().copied().unwrap_or(0);
+        let Some(fewest) = by_task.values().min().copied() else { continue };
         if runs.iter().all(|r| r.recipe.is_papers()) && fewest >= ENOUGH_SEEDS {
             continue;
         }
         let mut names: Vec<String> = runs.iter().map(|r| r.recipe.name()).collect();
         names.sort();
         names.dedup();
-        let names: Vec<String> =
-            names.into_iter().map(|n| if n.starts_with("settings") { n } else { format!("preset {n}") }).collect();
+        let preset = |n: String| if n.starts_with("settings") { n } else { format!("preset {n}") };
+        let names: Vec<String> = names.into_iter().map(preset).collect();
         let seeds = if fewest == 1 { "1 seed".to_owned() } else { format!("{fewest} seeds") };
         let ours = budgets(runs.iter().filter_map(|r| r.recipe.learner.as_ref()));
         let paper = budgets(runs.iter().filter_map(|r| r.recipe.paper.as_ref()));
         let ours = [Some(names.join(" and ")), ours, Some(seeds)].into_iter().flatten().collect::<Vec<_>>().join(", ");
         let paper = paper.map_or_else(String::new, |p| format!("{p}, "));
-        parts.push(format!("{} here: {ours}; in the paper: {paper}{ENOUGH_SEEDS} seeds.", method.title));
+        let text = format!("{ours}; in the paper: {paper}{ENOUGH_SEEDS} seeds.");
+        match parts.iter_mut().find(|p| p.0 == text) {
+            Some((_, titles)) => titles.push(&method.title),
+            None => parts.push((text, vec![&method.title])),
+        }
     }
+    let parts: Vec<String> = parts.iter().map(|(text, titles)| format!("{} here: {text}", joined(titles))).collect();
     (!parts.is_empty()).then(|| {
         format!(
             "Do not compare the paper's figures with ours as they stand: they were made with other settings or more seeds. {} A \
@@ -115,4 +130,16 @@ pub fn doubt(study: &Study, shift: Shift, against: &[Against]) -> Option<String>
             parts.join(" ")
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn digits_and_names_are_grouped() {
+        let spaced = |n: u64| thousands(n).replace('\u{a0}', " ");
+        assert_eq!([7, 60, 12_000, 1_000_000].map(spaced), ["7", "60", "12 000", "1 000 000"]);
+        assert_eq!([&["a"][..], &["a", "b"], &["a", "b", "c"]].map(joined), ["a", "a and b", "a, b and c"]);
+    }
 }

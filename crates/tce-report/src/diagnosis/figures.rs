@@ -222,7 +222,7 @@ pub(super) fn theorem(b: &Bounds) -> Markup {
     let panel = |title: &str, factor: f64, unit: &str, truth: Option<&Curve>, alone: Option<&Curve>| {
         figure(
             title,
-            &format!("without its factor, {}", number(factor)),
+            &format!("(the bound is {} times this)", number(factor)),
             ("λ", lambdas()),
             unit,
             false,

@@ -96,6 +96,10 @@ fn introduction(d: &Diagnosis) -> Markup {
 fn one(d: &Diagnosis) -> Markup {
     html! {
         h3 { "What was found, and what would be good" }
+        p class="note" {
+            (term("rms", "RMSE")) " is the typical size of an error. Actions are inferred from two states by the "
+            (term("inverse", "inverse dynamics model")) "."
+        }
         (figures_and_good(d))
         @if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) { p { "Copies: " (m) "." } }
         @if let Some(i) = &d.implied { p { (term("implied", "Implied policy")) ": " (i.sentence()) } (implied(i)) }

@@ -147,7 +147,11 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
             @if analysis.comparison.is_some() {
                 p class="note" {
                     "Points are of the " (term("score", "normalised score")) ": a random policy has 0, an expert of the target robot 100. A "
-                    (term("baseline", "baseline")) " is a simple method that a result has to beat. Methods are compared by their "
+                    (term("baseline", "baseline")) " is a simple method that a result has to beat"
+                    @if analysis.methods.iter().any(|m| m.floor && m.title.starts_with("BC")) {
+                        "; BC is " (term("bc", "behaviour cloning"))
+                    }
+                    ". Methods are compared by their "
                     (term("iqm", "interquartile mean")) ", the mean of the middle half of their runs; a run is one policy of one "
                     (term("seed", "seed")) "."
                     @if !analysis.recommendations.is_empty() {

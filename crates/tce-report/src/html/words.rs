@@ -38,7 +38,7 @@ static WORDS: &[Word] = &[
     word(
         "baseline",
         "Baseline, floor",
-        "A simple method that a result has to beat to be worth its effort: cloning the target rows (BC, in four forms), and implicit \
+        "A simple method that a result has to beat to be worth its effort: cloning the target rows (BC), and implicit \
          Q-learning (IQL) on the target rows alone. The program calls baselines floors. The best one is that with the highest \
          interquartile mean on the compared tasks.",
     ),
@@ -56,8 +56,8 @@ static WORDS: &[Word] = &[
     word(
         "interval",
         "Bootstrap interval",
-        "The runs are drawn anew, with replacement, thousands of times. The interval holds the figure in 95 of 100 of these draws. It \
-         tells how much other seeds might have changed the figure.",
+        "The runs are drawn anew, with replacement, thousands of times. The interval holds the given share of the figures that come out. \
+         It tells how much other seeds might have changed the figure.",
     ),
     word(
         "improvement",
@@ -69,7 +69,7 @@ static WORDS: &[Word] = &[
         "p",
         "p, permutation test",
         "How often a difference at least as large comes about when the runs of both methods are mixed and dealt out again by chance. \
-         Below 0.05 the difference is called more than chance.",
+         Where it is small enough, the difference is called more than chance.",
     ),
     word(
         "profile",
@@ -104,8 +104,8 @@ static WORDS: &[Word] = &[
     word(
         "coverage",
         "Coverage",
-        "The share of a robot's real states that have a generated state near them, nearer than their fifth neighbour among the real \
-         states.",
+        "The share of a robot's real states that have a generated state as near as one of their few nearest neighbours among the \
+         real states.",
     ),
     word(
         "filter",

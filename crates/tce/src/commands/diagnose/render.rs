@@ -40,7 +40,7 @@ fn reach(d: &Diagnosis) -> String {
             bound(d, b),
             share(b.coverage.map(|c| c.target)),
             share(b.coverage.and_then(|c| c.source)),
-            if filtered { percent(b.rejected) } else { "no filter".into() },
+            if filtered { percent(b.rejected) } else { "none".into() },
             share(b.memorisation.map(|m| m.probability)),
         ]
     });
@@ -50,13 +50,13 @@ fn reach(d: &Diagnosis) -> String {
         share(d.covered_by_target.map(|c| c.target)),
         d.covered_by_target.and_then(|c| c.source).map_or("-".into(), |s| format!("above {}", percent(s))),
         if filtered { percent(d.sampled.real_rejected) } else { "-".into() },
-        copies.map_or("-".into(), |m| format!("50 % (copies: {})", percent(m.of_copies))),
+        copies.map_or("-".into(), |m| format!("50 %, copies {}", percent(m.of_copies))),
     ];
     let header = ["y_max", "target reached", "source reached", "rejected", "nearer than fresh"];
     let second = if d.covered_by_fresh { "other target episodes" } else { "other target rows" };
     let text = format!(
         "Shares, by how far rows reach towards the source (y_max). Reached: real states with a generated one near; good is what {second} \
-         reach. Rejected: by the filter; good is its share of real target rows. Nearer than fresh: how often a generated row is nearer to a \
+         reach. Rejected: by the filter, if there is one; good is its share of real target rows. Nearer than fresh: how often a generated row is nearer to a \
          training row than a held-out row is.",
     );
     format!("{}\n{}", wrapped(&text, 0), table(&header, rows.chain([good])))
