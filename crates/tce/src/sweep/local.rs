@@ -44,7 +44,7 @@ impl Sweep {
         let _line = Headline::drawn_by(move || shown.lock().unwrap_or_else(PoisonError::into_inner).clone());
         let all = todo.len();
         let mut looked: Option<Instant> = None;
-        let progress = Progress::new("sweep", todo.len() as u64, "pieces of work");
+        let progress = Progress::uneven("sweep", todo.len() as u64, "pieces of work");
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
         let mut running: BTreeMap<usize, Child> = BTreeMap::new();
         let mut failed = 0;
