@@ -71,6 +71,8 @@ impl Counter {
 pub struct Progress {
     unit: &'static str,
     counter: Arc<Counter>,
+    /// Whether every unit costs the same, so that the rate tells what is left.
+    even: bool,
     bar: Option<ProgressBar>,
     quiet: bool,
     plain: Mutex<Plain>,
@@ -84,17 +86,26 @@ struct Plain {
 impl Progress {
     /// Starts a bar for `total` units of `unit` ("rows", "steps").
     pub fn new(label: impl Into<String>, total: u64, unit: &'static str) -> Self {
+        Self::start(label.into(), total, unit, true)
+    }
+
+    /// The same for units of different cost (pieces of a sweep, say), whose number does not tell what is left.
+    pub fn uneven(label: impl Into<String>, total: u64, unit: &'static str) -> Self {
+        Self::start(label.into(), total, unit, false)
+    }
+
+    fn start(label: String, total: u64, unit: &'static str, even: bool) -> Self {
         let started = Instant::now();
-        let counter = Arc::new(Counter { label: label.into(), total, done: AtomicU64::new(0), started });
+        let counter = Arc::new(Counter { label, total, done: AtomicU64::new(0), started });
         course::works(&counter);
         let bar = in_place().then(|| {
-            let bar = ProgressBar::new(total).with_prefix(counter.label.clone()).with_style(bar_style());
+            let bar = ProgressBar::new(total).with_prefix(counter.label.clone()).with_style(bar_style(even));
             let bar = LINES.add(bar);
             bar.enable_steady_tick(TICK);
             bar
         });
         let plain = Mutex::new(Plain { last: started, message: String::new() });
-        Self { unit, counter, bar, quiet: QUIET.load(Ordering::Relaxed), plain }
+        Self { unit, counter, even, bar, quiet: QUIET.load(Ordering::Relaxed), plain }
     }
 
     /// Reports that `n` more units are done.
@@ -113,9 +124,11 @@ impl Progress {
             let Counter { label, total, started, .. } = &*self.counter;
             let per_second = done as f64 / started.elapsed().as_secs_f64();
             let left = total.saturating_sub(done) as f64 / per_second.max(1e-9);
-            let (done, total, left) = (count(done), count(*total), duration(left));
-            let line =
-                format!("{label}: {done}/{total} {} ({}, {left} left) {}", self.unit, rate(per_second), plain.message);
+            let pace = match self.even {
+                true => format!("({}, {} left) {}", rate(per_second), duration(left), plain.message),
+                false => String::new(),
+            };
+            let line = format!("{label}: {}/{} {} {pace}", count(done), count(*total), self.unit);
             say(line.trim_end());
         }
     }
@@ -156,8 +169,11 @@ impl Drop for Progress {
 }
 
 /// One line of at most the terminal's width: a longer one would wrap, and leave a line behind whenever it is drawn anew.
-fn bar_style() -> ProgressStyle {
-    let template = "{prefix:22!} {wide_bar:.cyan/dim} {human_pos}/{human_len} {rate:>9} {left:>12} {msg:11!}";
+fn bar_style(even: bool) -> ProgressStyle {
+    let template = match even {
+        true => "{prefix:22!} {wide_bar:.cyan/dim} {human_pos}/{human_len} {rate:>9} {left:>12} {msg:11!}",
+        false => "{prefix:22!} {wide_bar:.cyan/dim} {human_pos}/{human_len}",
+    };
     let style = ProgressStyle::with_template(template).expect("a constant template");
     // What cannot be written into a line is left out of it.
     let write_rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
@@ -206,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_template_is_one() {
-        bar_style();
+    fn the_templates_are_such() {
+        let _ = [true, false].map(bar_style);
     }
 }

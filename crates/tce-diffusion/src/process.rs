@@ -22,11 +22,11 @@ use crate::DiffusionError;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum Process {
-    /// Appendix B.
+    /// Noise of bounded variance without drift, as Appendix B writes it.
     Ve(Ve),
-    /// Equation 5.
+    /// Noise that keeps the variance (Equation 5).
     Vp(Vp),
-    /// Karras et al. 2022.
+    /// Noise of a given spread, with a preconditioned network (Karras et al. 2022).
     Edm(Edm),
 }
 

@@ -14,6 +14,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use tce_base::Progress;
 use tce_learn::Policy;
 
 use crate::error::{Error, Result};
@@ -103,9 +104,11 @@ pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
 pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]) -> Result<Verdict> {
     let judge = judge()?;
     tce_base::begin_step("verdict");
-    let try_all =
-        |c: &Candidate| -> Result<Vec<Judged>> { c.files.iter().map(|f| judge.judge(&Policy::load(f)?)).collect() };
+    let progress = Progress::new("try policies", candidates.iter().map(|c| c.files.len() as u64).sum(), "policies");
+    let try_one = |file: &PathBuf| judge.judge(&Policy::load(file)?).inspect(|_| progress.inc(1));
+    let try_all = |c: &Candidate| c.files.iter().map(try_one).collect::<Result<Vec<_>>>();
     let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
+    progress.finish();
     decide(candidates, &judged)
 }
 

@@ -45,8 +45,9 @@ fn results(root: &Path) -> BTreeMap<String, String> {
     let mut out = BTreeMap::new();
     for path in files(root) {
         let name = path.strip_prefix(root).unwrap().display().to_string();
-        // TensorBoard's events hold the time.
-        if path.iter().any(|part| part == "tensorboard") || path.file_name().is_some_and(|n| n == "lock") {
+        // TensorBoard's events hold the time, and so does what steps have cost.
+        let no_result = |n: &std::ffi::OsStr| n == "lock" || n == "costs.json";
+        if path.iter().any(|part| part == "tensorboard") || path.file_name().is_some_and(no_result) {
             continue;
         }
         let bytes = fs::read(&path).unwrap();

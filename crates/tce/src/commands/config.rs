@@ -124,7 +124,11 @@ fn render(e: &Explanation) -> String {
         header.push(word);
         row.push(what.clone());
     }
-    let change = format!("--set {}={}", e.key, e.value);
+    // As a shell takes it.
+    let change = match e.value.trim_matches('"') {
+        value if value.contains([' ', '"', '{']) => format!("--set '{}={value}'", e.key),
+        value => format!("--set {}={value}", e.key),
+    };
     header.push("to change it");
     row.push(change);
     list(&header, [row])

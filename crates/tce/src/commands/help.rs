@@ -34,10 +34,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
                 "two methods, without the simple ones",
                 "tce run 'hopper-morph:medium->expert' --variant tce-og,otdf --no-floors",
             ),
-            (
-                "other settings",
-                "tce run 'hopper-morph:medium->expert' --set generator.y_max=0.1 --set learner.steps=20_000",
-            ),
+            ("other settings", "tce run 'hopper-morph:medium->expert' --set generator.y_max=0.1"),
         ],
     ),
     (
@@ -47,10 +44,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
                 "target rows and generated rows in one file",
                 "tce augment --source old.hdf5 --target new.hdf5 --out wider.hdf5",
             ),
-            (
-                "the generated rows alone, for Minari",
-                "tce augment --source old.hdf5 --target new.hdf5 --out wider --only-generated --format minari --id mine/wider-v0",
-            ),
+            ("the same for Minari", "tce augment --source old.hdf5 --target new.hdf5 --out wider --format minari"),
         ],
     ),
     (
@@ -81,7 +75,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         "judge",
         &[(
             "two policies without a simulator",
-            "tce judge one.safetensors other.safetensors --source old.hdf5 --target new.hdf5",
+            "tce judge a.safetensors b.safetensors --source old.hdf5 --target new.hdf5",
         )],
     ),
     (
@@ -115,11 +109,11 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             (
                 "D4RL's recipe, by the zoo's actors",
-                "tce collect --env hopper --quality medium-replay --out hopper-medium-replay.hdf5",
+                "tce collect --env hopper --quality medium-replay --out replay.hdf5",
             ),
             (
                 "a mixture of two policies",
-                "tce collect --env ant-gravity --actor a.safetensors:0.3 --actor b.safetensors:0.7 --rows 5000 --out mine.hdf5",
+                "tce collect --env ant-gravity --actor a.npz:0.3 --actor b.npz:0.7 --out x.hdf5",
             ),
         ],
     ),
@@ -166,8 +160,8 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         "diagnose generator",
         &[
             (
-                "noise processes and samplers",
-                "tce diagnose generator 'hopper-morph:medium->expert' --processes edm --samplers dpm:20,heun:18",
+                "two samplers with every noise process",
+                "tce diagnose generator 'hopper-morph:medium->expert' --samplers dpm:20,heun:18",
             ),
             ("every network that the training kept", "tce diagnose generator 'hopper-morph:medium->expert' --cycles"),
         ],
@@ -177,7 +171,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         "sweep launch",
         &[
             ("two runs at a time, here; again after any accident", "tce sweep launch runs/sweeps/sweep --workers 2"),
-            ("on a cluster", "tce sweep launch runs/sweeps/sweep --launcher slurm --sbatch=--time=04:00:00 --pack 4"),
+            ("on a cluster", "tce sweep launch runs/sweeps/sweep --launcher slurm --sbatch=--time=04:00:00"),
         ],
     ),
     ("sweep run-one", &[("pieces 3 and 4 of the list", "tce sweep run-one runs/sweeps/sweep 3 4")]),
@@ -211,7 +205,9 @@ pub fn command() -> Command {
         let text = text_of(examples, &on, &off);
         command = at(command, &path.split_whitespace().collect::<Vec<_>>(), &|c| c.after_help(text.clone()));
     }
-    command.help_template(format!("{{about}}\n\n{{usage-heading}} {{usage}}\n\n{groups}\n{{options}}{{after-help}}"))
+    command.help_template(format!(
+        "{{about}}\n\n{{usage-heading}} {{usage}}\n\n{groups}{on}Global options:{off}\n{{options}}{{after-help}}"
+    ))
 }
 
 /// clap's own style for headings; it is taken out again where there are no colours.
@@ -284,6 +280,7 @@ mod tests {
     fn clap_takes_every_example() {
         for (path, examples) in EXAMPLES {
             for (_, line) in *examples {
+                assert!(line.len() <= 78, "{line}: too long for a terminal");
                 let words = words(line);
                 assert!(path.is_empty() || words[1..].join(" ").starts_with(path), "{line}: no example of {path}");
                 if let Err(e) = command().try_get_matches_from(&words) {

@@ -1,7 +1,7 @@
 //! Tables that fit where they are shown.
 //!
-//! A table that is too wide is tried in three other forms, in this order: with its texts broken between words, on its side (a column for
-//! each row), and as a list with a line for each cell. Words, numbers and paths are never broken: they are read, compared and copied.
+//! A table that is too wide is tried in four other forms, in this order: with its texts broken between words, without blanks around its
+//! cells, on its side (a column for each row), and as a list with a line for each cell. Words, numbers and paths are never broken: they are read, compared and copied.
 
 use comfy_table::presets::UTF8_FULL_CONDENSED;
 use comfy_table::{Attribute, Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Table, Width};
@@ -11,8 +11,8 @@ use super::wrap::break_line;
 
 /// Stands before a cell that is the best of its kind; a character that no text has.
 const BEST: char = '\u{e000}';
-/// Columns of a table besides its texts: a border and two blanks for each column, and one border more.
-const FRAME: usize = 3;
+/// Blanks on both sides of a cell.
+const BLANKS: usize = 1;
 
 /// A cell that [`table`] shows as the best of its kind, where there are colours.
 fn best(text: &str) -> String {
@@ -34,7 +34,7 @@ pub fn heading(text: &str) -> String {
     console::style(text).bold().to_string()
 }
 
-/// A table as wide as the terminal allows: the first column is text, the others are numbers and stand right-aligned.
+/// A table as wide as the terminal allows. The first column is text; others stand right-aligned where there are numbers in them.
 pub fn table<R, C>(header: &[&str], rows: impl IntoIterator<Item = R>) -> String
 where
     R: IntoIterator<Item = C>,
@@ -58,28 +58,32 @@ where
 
 fn fitted(header: &[String], rows: &[Vec<String>], width: Option<usize>, coloured: bool) -> String {
     let natural = columns(header, rows, measure);
-    let Some(width) = width else { return drawn(header, rows, &natural, coloured) };
-    let total = |columns: &[usize]| columns.iter().sum::<usize>() + FRAME * columns.len() + 1;
-    if total(&natural) <= width {
-        return drawn(header, rows, &natural, coloured);
+    let Some(width) = width else { return drawn(header, rows, &natural, BLANKS, coloured) };
+    if total(&natural, BLANKS) <= width {
+        return drawn(header, rows, &natural, BLANKS, coloured);
     }
     let mut broken = columns(header, rows, longest_word);
-    if total(&broken) <= width {
+    if let Some(blanks) = [BLANKS, 0].into_iter().find(|blanks| total(&broken, *blanks) <= width) {
         // What is left goes to the columns that lack most.
-        for _ in total(&broken)..width {
+        for _ in total(&broken, blanks)..width {
             let Some(i) = (0..broken.len()).max_by_key(|i| natural[*i].saturating_sub(broken[*i])) else { break };
             broken[i] += usize::from(broken[i] < natural[i]);
         }
-        return drawn(header, rows, &broken, coloured);
+        return drawn(header, rows, &broken, blanks, coloured);
     }
     let side = |i: usize| std::iter::once(header[i].clone()).chain(rows.iter().map(move |row| row[i].clone()));
     let (first, others) =
         (side(0).collect::<Vec<_>>(), (1..header.len()).map(|i| side(i).collect()).collect::<Vec<_>>());
     let natural = columns(&first, &others, measure);
-    if total(&natural) <= width {
-        return drawn(&first, &others, &natural, coloured);
+    if total(&natural, BLANKS) <= width {
+        return drawn(&first, &others, &natural, BLANKS, coloured);
     }
     listed(header, rows, Some(width), coloured)
+}
+
+/// The width of a table with a border before every column and one behind the last.
+fn total(columns: &[usize], blanks: usize) -> usize {
+    columns.iter().map(|width| width + 2 * blanks + 1).sum::<usize>() + 1
 }
 
 fn measure(text: &str) -> usize {
@@ -100,16 +104,26 @@ fn columns(header: &[String], rows: &[Vec<String>], measure: impl Fn(&str) -> us
     (0..header.len()).map(|i| column(i).map(|cell| measure(cell)).max().unwrap_or(0)).collect()
 }
 
-fn drawn(header: &[String], rows: &[Vec<String>], columns: &[usize], coloured: bool) -> String {
+fn drawn(header: &[String], rows: &[Vec<String>], columns: &[usize], blanks: usize, coloured: bool) -> String {
     let mut table = Table::new();
     table.load_preset(UTF8_FULL_CONDENSED).set_content_arrangement(ContentArrangement::Dynamic);
     // Without a width of its own the table would ask the terminal.
-    table.set_width(columns.iter().sum::<usize>() as u16 + (FRAME * columns.len()) as u16 + 1);
+    table.set_width(total(columns, blanks) as u16);
     if coloured {
         table.enforce_styling();
     } else {
         table.force_no_tty();
     }
+    let number = |cell: &str| {
+        let mut start = cell.trim_start_matches(BEST).chars();
+        match start.next() {
+            Some('-' | '+') => start.next().is_none_or(|c| c.is_ascii_digit()),
+            first => first.is_some_and(|c| c.is_ascii_digit()),
+        }
+    };
+    let right: Vec<bool> = (0..header.len())
+        .map(|i| i > 0 && rows.iter().any(|row| row.get(i).is_some_and(|c| number(c) && c != "-")))
+        .collect();
     table.set_header(header.iter().map(|h| Cell::new(h.trim_start_matches(BEST)).add_attribute(Attribute::Bold)));
     for row in rows {
         table.add_row(row.iter().enumerate().map(|(i, text)| {
@@ -117,11 +131,12 @@ fn drawn(header: &[String], rows: &[Vec<String>], columns: &[usize], coloured: b
             if text.starts_with(BEST) {
                 cell = cell.fg(Color::Green).add_attribute(Attribute::Bold);
             }
-            if i == 0 { cell } else { cell.set_alignment(CellAlignment::Right) }
+            if right[i] { cell.set_alignment(CellAlignment::Right) } else { cell }
         }));
     }
     for (column, width) in table.column_iter_mut().zip(columns) {
-        column.set_constraint(ColumnConstraint::Absolute(Width::Fixed(*width as u16 + 2)));
+        column.set_padding((blanks as u16, blanks as u16));
+        column.set_constraint(ColumnConstraint::Absolute(Width::Fixed((width + 2 * blanks) as u16)));
     }
     table.to_string()
 }
@@ -187,6 +202,19 @@ mod tests {
 │ TCE(OG)            ┆ 95.9 ± 1.2 ┆ 16321 │
 └────────────────────┴────────────┴───────┘";
         assert_eq!(shown(Some(43)), expected);
+    }
+
+    #[test]
+    fn a_table_that_almost_fits_goes_without_blanks() {
+        let header = texts(&["actor", "return", "length"]);
+        let rows = [texts(&["ant-source-expert", "3132 ± 599", "962"])];
+        let expected = "\
+┌─────────────────┬──────────┬──────┐
+│actor            ┆return    ┆length│
+╞═════════════════╪══════════╪══════╡
+│ant-source-expert┆3132 ± 599┆   962│
+└─────────────────┴──────────┴──────┘";
+        assert_eq!(fitted(&header, &rows, Some(40), false), expected);
     }
 
     #[test]

@@ -44,7 +44,7 @@ impl Sweep {
         let _line = Headline::drawn_by(move || shown.lock().unwrap_or_else(PoisonError::into_inner).clone());
         let all = todo.len();
         let mut looked: Option<Instant> = None;
-        let progress = Progress::new("sweep", todo.len() as u64, "pieces of work");
+        let progress = Progress::uneven("sweep", todo.len() as u64, "pieces of work");
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
         // The last message of each piece: one that fails twice in the same words fails a third time, too.
         let mut messages: BTreeMap<usize, String> = BTreeMap::new();
