@@ -91,6 +91,7 @@ impl Run {
             })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
+        tce_sim::open_library()?;
         // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
         let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);
         let inputs = Inputs::of_config(self.task, &self.data, widest)?;
