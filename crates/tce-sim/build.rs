@@ -1,17 +1,9 @@
 //! Brings libmujoco 3.17.0: out of the `mujoco` wheel of PyPI, checked against a pinned SHA-256, into
 //! `third_party/mujoco/` of the workspace (ignored by git).
 //!
-//! `mujoco-rs` has a build script of its own, which may run first. It is content with a file named `libmujoco.so` in
-//! `MUJOCO_DYNAMIC_LINK_DIR` (`.cargo/config.toml`): the linker script in `link/`, which names the real library. That
-//! one is only looked up when a binary is linked, and every binary is linked after this script has ended.
-//!
-//! A binary also needs the library when it runs. Link arguments do not travel from a library to the binaries that use
-//! it, so a package with binaries or tests that link `tce-sim` passes the rpath on in its own build script:
-//!
-//! ```text
-//! let dir = std::env::var("DEP_TCE_MUJOCO_LIB_DIR").expect("tce-sim's build script sets it");
-//! println!("cargo::rustc-link-arg=-Wl,-rpath,{dir}");
-//! ```
+//! Nothing is linked with it: `src/library.rs` opens it when the simulator is first used, and one of the places where it
+//! looks is the folder that this script tells it. `mujoco-rs` has a build script of its own, which is content with a
+//! file named `libmujoco.so` in `MUJOCO_DYNAMIC_LINK_DIR` (`.cargo/config.toml`): the empty linker script in `link/`.
 
 use std::env;
 use std::fs;
@@ -57,9 +49,7 @@ fn main() {
     match library_dir() {
         Ok(dir) => {
             println!("cargo::rerun-if-changed={}", dir.join(LIBRARY).display());
-            println!("cargo::rustc-link-search=native={}", dir.display());
-            println!("cargo::rustc-link-arg=-Wl,-rpath,{}", dir.display());
-            println!("cargo::metadata=lib_dir={}", dir.display());
+            println!("cargo::rustc-env=TCE_MUJOCO_BUILD_DIR={}", dir.display());
         }
         Err(message) => {
             // Cargo shows these without the noise of a panic.

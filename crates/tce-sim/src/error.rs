@@ -1,5 +1,7 @@
 use tce_data::{Agent, Shift};
 
+use crate::library::LibraryError;
+
 /// What can go wrong in the simulator.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
@@ -13,17 +15,9 @@ pub enum SimError {
         /// MuJoCo's message.
         message: String,
     },
-    /// Another MuJoCo than the one the models are made for was loaded.
-    #[error(
-        "libmujoco: version {found} was loaded, expected {expected}; unset LD_LIBRARY_PATH and TCE_MUJOCO_LIB, or let \
-         them name version {expected}"
-    )]
-    Version {
-        /// Version string of the loaded library.
-        found: String,
-        /// Version string asked for.
-        expected: &'static str,
-    },
+    /// There is no MuJoCo, or another one than the models are made for.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
     /// A table or buffer does not have the robot's dimensions.
     #[error("{what}: found {found}, expected {expected} for {agent}")]
     Dimension {

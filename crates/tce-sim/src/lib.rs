@@ -8,6 +8,7 @@
 //! | A policy's returns? | [`evaluate`] |
 //! | What it looks like? | [`evaluate_recorded`], then a [`film::Film`] of the recordings |
 //! | Do stored transitions follow the dynamics? | [`replay`] (whole data sets), [`simulate`] (single rows) |
+//! | Is there a MuJoCo? | [`open_library`], before a command begins; everything else opens it by itself |
 //! | Would a generated state end the episode? | [`terminal_rule`] |
 
 mod actor;
@@ -15,6 +16,7 @@ mod analysis;
 mod env;
 mod error;
 pub mod film;
+mod library;
 pub mod models;
 mod recording;
 mod replay;
@@ -24,6 +26,7 @@ pub use actor::{Actor, UniformActor};
 pub use analysis::{Simulated, simulate};
 pub use env::{EPISODE_LIMIT, Env, StepResult, terminal_rule};
 pub use error::SimError;
+pub use library::{LibraryError, open as open_library};
 pub use recording::{Ending, Recording};
 pub use replay::{Quantiles, ReplayReport, replay};
 pub use rollout::{CollectOptions, EpisodeResult, collect, evaluate, evaluate_recorded};

@@ -101,6 +101,11 @@ pub fn names() -> impl Iterator<Item = &'static str> {
     WORKLOADS.iter().map(|w| w.0)
 }
 
+/// Whether the workload `name` needs the simulator.
+pub fn simulates(name: &str) -> bool {
+    name.starts_with("env-")
+}
+
 /// How a workload did.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {

@@ -33,6 +33,7 @@ mod stage;
 mod stand_ins;
 mod study;
 mod sweep;
+mod told;
 mod units;
 mod variant;
 mod verdict;
@@ -43,12 +44,6 @@ mod zoo;
 /// What files say about who wrote them.
 const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));
 
-/// An error as the terminal shows it: its own words, once. They hold what caused it, so that the chain of causes would say it again.
-pub fn report(error: Error) -> miette::Report {
-    // A second call, in a test, finds the hook set.
-    let _ = miette::set_hook(Box::new(|_| Box::new(miette::MietteHandlerOpts::new().without_cause_chain().build())));
-    miette::Report::new(error)
-}
-
 pub use commands::Cli;
 pub use error::{Error, Result};
+pub use told::told;

@@ -25,7 +25,7 @@ fn main() -> ExitCode {
             // The line above the bars goes away before the error stands below them.
             tce_base::end_course(false);
             let code = error.exit_code();
-            eprintln!("{:?}", tce::report(error));
+            eprint!("{}", tce::told(&error));
             ExitCode::from(code as u8)
         }
     }

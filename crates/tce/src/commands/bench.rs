@@ -8,7 +8,7 @@ use tce_base::{set_quiet, write_json};
 
 use tce_nn::Device;
 
-use crate::bench::{Measured, On, measure, names};
+use crate::bench::{Measured, On, measure, names, simulates};
 use crate::config::Length;
 use crate::error::{Error, Result};
 use crate::layers::{Layered, Preset};
@@ -72,6 +72,9 @@ impl Bench {
             true => names().collect(),
             false => self.workloads.iter().map(String::as_str).collect(),
         };
+        if names.iter().any(|n| simulates(n)) {
+            tce_sim::open_library()?;
+        }
         let on = On { device: device.clone(), seeds: self.seeds };
         let mut core_gflops = tce_nn::product_rate(0.1);
         let mut workloads = Vec::new();

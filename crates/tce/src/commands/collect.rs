@@ -62,6 +62,7 @@ impl Collect {
         if self.rows == 0 || self.lanes == 0 {
             return Err(Error::Usage("--rows and --lanes must be at least 1".into()));
         }
+        tce_sim::open_library()?;
         let (agent, shift) = self.env;
         let recipe = match self.quality {
             Some(quality) => {

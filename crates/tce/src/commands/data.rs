@@ -245,6 +245,9 @@ impl Uses {
 
 impl CheckArgs {
     fn run(self, output: Output) -> Result<()> {
+        if self.replay {
+            tce_sim::open_library()?;
+        }
         let mut all = Vec::new();
         for file in &self.files {
             let (own, Loaded { transitions, report, .. }) = self.own.read(file)?;

@@ -90,6 +90,7 @@ impl Evaluate {
         if self.episodes == 0 {
             return Err(Error::Usage("--episodes must be at least 1".into()));
         }
+        tce_sim::open_library()?;
         let (agent, shift) = self.env;
         let arena = Arena::new(agent, shift, ScoreTable::default());
         let studio = self.studio()?;

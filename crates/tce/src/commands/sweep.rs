@@ -228,6 +228,9 @@ impl Launch {
                 Ok(())
             }
             Launcher::Local => {
+                if !sweep.missing()?.is_empty() {
+                    tce_sim::open_library()?;
+                }
                 let cores = std::thread::available_parallelism().map_or(1, usize::from);
                 // Several programs on one GPU take each other's time.
                 let fitting = if processor == Processor::Cpu { (cores / self.threads_each).max(1) } else { 1 };

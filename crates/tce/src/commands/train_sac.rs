@@ -121,6 +121,7 @@ impl TrainSac {
                 return Err(Error::Usage(format!("{}-{} is named twice", environment.0, environment.1)));
             }
         }
+        tce_sim::open_library()?;
         for &(agent, shift) in &self.environments {
             for seed in self.seed..self.seed + self.seeds {
                 let settings = Settings {

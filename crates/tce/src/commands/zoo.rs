@@ -155,6 +155,7 @@ impl Rollout {
         if self.episodes == 0 {
             return Err(Error::Usage("--episodes must be at least 1".into()));
         }
+        tce_sim::open_library()?;
         let exhibits = if self.names.is_empty() {
             Exhibit::all()
         } else {
@@ -197,6 +198,7 @@ impl Keep {
         if self.episodes < 20 {
             return Err(Error::Usage("--episodes: a card needs at least 20".into()));
         }
+        tce_sim::open_library()?;
         let full = NamedParameters::load(&self.policy)?;
         let card = Card::of(&full, &self.policy)?.ok_or_else(|| {
             Error::Usage(format!("{}: has no card; give a policy written by `tce train-sac`", self.policy.display()))

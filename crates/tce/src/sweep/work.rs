@@ -188,6 +188,8 @@ impl Sweep {
     }
 
     fn compute(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
+        // Before hours of training, not after them.
+        tce_sim::open_library()?;
         let started = Instant::now();
         forget_peak_memory();
         let config = self.manifest.config(entry)?;

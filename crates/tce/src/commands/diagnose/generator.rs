@@ -123,6 +123,7 @@ fn sampler_name(sampler: &Sampler) -> String {
 impl GeneratorArgs {
     /// Runs the subcommand.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
+        tce_sim::open_library()?;
         if self.cycles {
             return self.cycles(output, device);
         }

@@ -215,6 +215,9 @@ impl RunArgs {
                     ));
                 }
                 can_be_diagnosed(&directory.display().to_string(), &run.config)?;
+                if options.simulator {
+                    tce_sim::open_library()?;
+                }
                 let seed = self.seed.unwrap_or(run.seeds[0]);
                 member_of(&run.seeds, seed)?;
                 let root = self.out.unwrap_or_else(|| run.root.clone());
