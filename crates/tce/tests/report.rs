@@ -90,7 +90,7 @@ fn a_sweep_becomes_a_page() {
         "{doubt}"
     );
     let page = fs::read_to_string(sweep.join("report.html")).unwrap();
-    for text in ["TCE(OG), &lt;b&gt;&amp;y", "shown to beat it", "62.0", "1.0 GiB", "Table 1", "y_max = 0.1"] {
+    for text in ["TCE(OG), &lt;b&gt;&amp;y", "that is more than chance", "62.0", "1.0 GiB", "Table 1", "y_max = 0.1"] {
         assert!(page.contains(text), "{text}");
     }
     assert!(!page.contains("<b>&y") && !page.contains("http:") && !page.contains("https:"));
