@@ -14,8 +14,6 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use npyz::npz::array_name_from_file_name;
-use npyz::{NpyFile, Order};
 use tce_base::FileError;
 use tce_data::Standardizer;
 use tce_nn::{Activation, NamedParameters};
@@ -23,6 +21,7 @@ use zip::ZipArchive;
 
 use crate::error::LearnError;
 use crate::mlp_policy::{Head, MlpPolicy, PolicySpec};
+use crate::npy::{self, Array};
 use crate::policy::Policy;
 
 const REMEDY: &str = "see the table of kinds in the documentation of tce_learn::import";
@@ -116,12 +115,6 @@ impl Matrix {
     }
 }
 
-enum Array {
-    Text(String),
-    /// Shape and values, row-major.
-    Numbers(Vec<usize>, Vec<f64>),
-}
-
 /// The arrays of one file.
 struct Arrays<'a> {
     path: &'a Path,
@@ -136,7 +129,7 @@ impl<'a> Arrays<'a> {
         let mut by_name = BTreeMap::new();
         for k in 0..archive.len() {
             let entry = archive.by_index(k).map_err(|e| io(e.into()))?;
-            let Some(name) = array_name_from_file_name(entry.name()).map(str::to_owned) else { continue };
+            let Some(name) = entry.name().strip_suffix(".npy").map(str::to_owned) else { continue };
             by_name.insert(name, array(entry).map_err(io)?);
         }
         Ok(Self { path, by_name })
@@ -192,51 +185,5 @@ const LARGEST_ARRAY: u64 = 1 << 28;
 fn array(entry: impl Read) -> std::io::Result<Array> {
     let mut bytes = Vec::new();
     entry.take(LARGEST_ARRAY).read_to_end(&mut bytes)?;
-    // Of the format's versions 2 and 3; npyz takes the memory for the header that they promise.
-    let promised = match (bytes.get(6), bytes.get(8..12)) {
-        (Some(2..), Some(size)) => u32::from_le_bytes(size.try_into().expect("4 bytes")) as usize,
-        _ => 0,
-    };
-    if promised > bytes.len() {
-        let what = format!("a header of {promised} bytes in an array of {}", bytes.len());
-        return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
-    }
-    parse(NpyFile::new(&bytes[..])?)
-}
-
-/// Texts are names of kinds.
-const LONGEST_TEXT: usize = 1000;
-
-/// The values of an array. Memory grows with what is read: the shape in a damaged file may promise anything.
-fn all<T: npyz::Deserialize, R: Read>(file: NpyFile<R>) -> std::io::Result<Vec<T>> {
-    let data = file.data().map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e.to_string()))?;
-    let mut out = Vec::new();
-    for value in data {
-        out.push(value?);
-    }
-    Ok(out)
-}
-
-/// One array: numbers of f32 or f64, or a text.
-fn parse<R: Read>(file: NpyFile<R>) -> std::io::Result<Array> {
-    let shape: Vec<usize> = file.shape().iter().map(|&n| n as usize).collect();
-    let (order, descr) = (file.order(), file.dtype().descr());
-    let values: Vec<f64> = match descr.trim_matches('\'') {
-        "<f8" => all(file)?,
-        "<f4" => all::<f32, _>(file)?.into_iter().map(f64::from).collect(),
-        text if text.strip_prefix("<U").is_some_and(|n| n.parse::<usize>().is_ok_and(|n| n <= LONGEST_TEXT)) => {
-            return Ok(Array::Text(all::<String, _>(file)?.concat()));
-        }
-        other => {
-            let what = format!("an array of type {other}; only <f4, <f8 and texts are read");
-            return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
-        }
-    };
-    let row_major = match (order, shape.as_slice()) {
-        (Order::Fortran, &[rows, columns]) => {
-            (0..rows * columns).map(|k| values[k % columns * rows + k / columns]).collect()
-        }
-        _ => values,
-    };
-    Ok(Array::Numbers(shape, row_major))
+    npy::parse(&bytes)
 }

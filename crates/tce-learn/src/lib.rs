@@ -40,6 +40,7 @@ pub mod meta_dt;
 mod mlp_policy;
 mod mode;
 mod networks;
+mod npy;
 pub mod on_iql;
 pub mod otdf;
 pub mod pair_model;

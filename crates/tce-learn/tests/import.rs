@@ -1,34 +1,53 @@
 //! Policies of other programs: against formulas written out in f64, and against all files of the shared collection.
 
+use std::fs::File;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use npyz::npz::NpzWriter;
-use npyz::{DType, Order, WriterBuilder};
 use tce_base::{Rng, Streams, random::fill_normal};
 use tce_learn::{Head, Policy, PolicyKind};
+use zip::ZipWriter;
+use zip::write::FileOptions;
 
 /// One array of a file: name, shape, row-major values.
 type Array = (&'static str, Vec<u64>, Vec<f64>);
 
+/// How numpy stores a matrix.
+#[derive(Clone, Copy, PartialEq)]
+enum Order {
+    C,
+    Fortran,
+}
+
+/// An array as numpy's `save` writes it.
+fn npy(descr: &str, order: Order, shape: &[u64], body: impl Iterator<Item = u8>) -> Vec<u8> {
+    let shape: String = shape.iter().map(|n| format!("{n}, ")).collect();
+    let fortran = if order == Order::Fortran { "True" } else { "False" };
+    let header = format!("{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': ({shape}), }}");
+    let header = format!("{header:<117}\n");
+    let size = (header.len() as u16).to_le_bytes();
+    [b"\x93NUMPY\x01\x00".as_slice(), &size, header.as_bytes()].concat().into_iter().chain(body).collect()
+}
+
+/// An archive as numpy's `savez_compressed` writes it.
 fn write(path: &Path, texts: &[(&str, &str)], arrays: &[Array], order: Order) {
-    let mut npz = NpzWriter::create(path).unwrap();
+    let mut npz = ZipWriter::new(File::create(path).unwrap());
+    let mut add = |name: &str, bytes: Vec<u8>| {
+        npz.start_file(format!("{name}.npy"), FileOptions::default()).unwrap();
+        npz.write_all(&bytes).unwrap();
+    };
     for (name, text) in texts {
-        let dtype = DType::Plain(format!("<U{}", text.len()).parse().unwrap());
-        let writer = npz.array::<str>(name, Default::default()).unwrap().dtype(dtype).shape(&[]);
-        let mut writer = writer.begin_nd().unwrap();
-        writer.push(text).unwrap();
-        writer.finish().unwrap();
+        let letters = text.chars().flat_map(|c| (c as u32).to_le_bytes());
+        add(name, npy(&format!("<U{}", text.len()), Order::C, &[], letters));
     }
     for (name, shape, values) in arrays {
-        let writer = npz.array::<f64>(name, Default::default()).unwrap().default_dtype().order(order).shape(shape);
-        let mut writer = writer.begin_nd().unwrap();
         let at = |k: usize| match (order, shape.as_slice()) {
             (Order::Fortran, &[rows, columns]) => values[k % rows as usize * columns as usize + k / rows as usize],
             _ => values[k],
         };
-        (0..values.len()).for_each(|k| writer.push(&at(k)).unwrap());
-        writer.finish().unwrap();
+        add(name, npy("<f8", order, shape, (0..values.len()).flat_map(|k| at(k).to_le_bytes())));
     }
+    npz.finish().unwrap();
 }
 
 fn numbers(name: &'static str, shape: &[u64], scale: f64) -> Array {

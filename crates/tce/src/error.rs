@@ -2,10 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use miette::Diagnostic;
-
 /// Any reason for which a command fails.
-#[derive(Debug, thiserror::Error, Diagnostic)]
+#[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The command line or a configuration is wrong: exit code 2.
     #[error("{0}")]

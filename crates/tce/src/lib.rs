@@ -28,6 +28,7 @@ mod stage;
 mod stand_ins;
 mod study;
 mod sweep;
+mod told;
 mod units;
 mod variant;
 mod verdict;
@@ -39,3 +40,4 @@ const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));
 
 pub use commands::Cli;
 pub use error::{Error, Result};
+pub use told::told;
