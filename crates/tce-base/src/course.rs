@@ -244,8 +244,8 @@ mod tests {
         let Some(began) = now.checked_sub(Duration::from_secs(100)) else { return };
         let mut c = course();
         c.begin("two", began);
-        for (label, line) in [("learn bc", "step 3 of 3, about 5 min left: two"), ("train cvae", "step 3 of 3: two")] {
-            let counter = counter(label, 25, began);
+        for (label, line) in [("learn bc", "step 3 of 3, about 4 min left: two"), ("train cvae", "step 3 of 3: two")] {
+            let counter = counter(label, 30, began);
             c.bar = Some(Arc::downgrade(&counter));
             assert_eq!(c.line(now), line);
         }

@@ -74,8 +74,8 @@ fn a_key_is_explained_and_a_table_lists_its_keys() {
     let call = ["config", "show", "generator.y_max", "--preset", "quick", "--set", "generator.y_max=0.1"];
     let expected = "\
 generator.y_max
-  what it does  How far generated states may go from the target's to the
-                source's: ŷ ~ U(0, y_max).
+  what it does  How far generated states may go from the target's to
+                the source's: ŷ ~ U(0, y_max).
   value         0.1
   from          --set generator.y_max=0.1
   in presets    paper 0.2, default 0.2, quick 0.2
@@ -133,7 +133,7 @@ fn bars_leave_no_line_behind_on_a_terminal() {
     data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let tiny = TINY.join(" ");
     let args = format!(
-        "augment --source source.hdf5 --target target.hdf5 --out wider.hdf5 {tiny} --set generator.transition_steps=2000"
+        "augment --source source.hdf5 --target target.hdf5 --out wider.hdf5 {tiny} --set generator.transition_steps=2000 --set generator.rows=6000 --set generator.sampler.steps=10"
     );
     let Some((bytes, shown)) = on_terminal(dir.path(), &args, "") else { return };
     let raw = String::from_utf8_lossy(&bytes);
