@@ -38,11 +38,11 @@ enum Subject {
     Key(String),
 }
 
-/// A task has a colon, a key has none.
+/// A task has a slash (or, in its first form, a colon), a key has neither.
 fn subject(text: &str) -> std::result::Result<Subject, String> {
     match text.parse::<Task>() {
         Ok(task) => Ok(Subject::Task(task)),
-        Err(e) if text.contains(':') => Err(e.to_string()),
+        Err(e) if text.contains([':', '/']) => Err(e.to_string()),
         Err(_) => Ok(Subject::Key(text.trim_end_matches('.').to_owned())),
     }
 }
