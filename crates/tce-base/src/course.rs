@@ -145,8 +145,12 @@ pub fn end_course(whole: bool) {
     let ended = course().take();
     drop(HEADLINE.lock().unwrap_or_else(PoisonError::into_inner).take());
     if let (Some(mut course), true) = (ended, whole) {
+        let before = course.costs.clone();
         course.end(Instant::now());
-        remember(course.memory.zip(Some(course.costs)));
+        // A command that found everything done changes nothing.
+        if course.costs != before {
+            remember(course.memory.zip(Some(course.costs)));
+        }
     }
 }
 

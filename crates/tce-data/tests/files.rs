@@ -229,7 +229,7 @@ fn a_full_disk_is_an_error_and_leaves_nothing() {
     let left = std::fs::read_dir(dir.path()).unwrap().count();
     let unmounted = Command::new("umount").arg(dir.path()).status().unwrap().success();
     let text = result.unwrap_err().to_string();
-    assert!(text.contains("out.hdf5") && text.contains("No space left on device"), "{text}");
+    assert!(text.contains("out.hdf5") && text.contains("no space is left on the device"), "{text}");
     assert_eq!(left, 0, "a partial file was left behind");
     assert!(unmounted);
 }

@@ -305,6 +305,10 @@ impl Training {
         goal: Goal,
         device: &Device,
     ) -> Result<Self> {
+        if !directory.join("settings.json").exists() {
+            // Nothing is left behind by a training that cannot begin.
+            from.map(|from| Origin::of(from, settings.agent)).transpose()?;
+        }
         std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let lock = lock(directory)?;
         let path = directory.join("settings.json");

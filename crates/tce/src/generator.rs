@@ -403,10 +403,12 @@ const HELD_OUT_RUN: usize = 25;
 
 /// The rows of `n` to train on, and the share that is held out, in runs at random places; both ascending. The same for all seeds.
 pub(crate) fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
-    let runs = n.div_ceil(HELD_OUT_RUN);
+    // Of a single run one half would be held out from the other.
+    let length = if n > HELD_OUT_RUN { HELD_OUT_RUN } else { n.div_ceil(2).max(1) };
+    let runs = n.div_ceil(length);
     let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
     let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
-    (0..n).partition(|i| chosen.binary_search(&(i / HELD_OUT_RUN)).is_err())
+    (0..n).partition(|i| chosen.binary_search(&(i / length)).is_err())
 }
 
 /// Of `n` target rows, those that the networks of `config` are trained on, and those that are held out to tell when to stop.
