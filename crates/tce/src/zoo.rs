@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use include_dir::{Dir, include_dir};
 use serde::{Deserialize, Serialize};
-use tce_base::sha256_hex;
+use tce_base::{did_you_mean, sha256_hex};
 use tce_data::{Agent, Shift};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
@@ -98,13 +98,12 @@ impl Exhibit {
     /// The one called `name`.
     ///
     /// # Errors
-    /// If there is none; the message lists what is there.
+    /// If there is none; the message names the one that is most like it.
     pub fn find(name: &str) -> Result<Self> {
         let all = Self::all();
         all.iter().find(|e| e.name == name).copied().ok_or_else(|| {
-            let names: Vec<_> = all.iter().map(|e| e.name).collect();
-            let there = if names.is_empty() { "nothing yet".into() } else { names.join(", ") };
-            Error::Usage(format!("the zoo has no `{name}`; it has {there}"))
+            let hint = did_you_mean(name, all.iter().map(|e| e.name));
+            Error::Usage(format!("the zoo has no actor `{name}` (tce zoo list shows all){hint}"))
         })
     }
 
