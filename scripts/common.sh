@@ -43,6 +43,23 @@ install_file() {
   fi
 }
 
+# Manual pages and completions, made by a program that runs here: helps PROGRAM PREFIX
+helps() {
+  "$1" man --out "$2/share/man/man1" > /dev/null || fail "$2/share/man: cannot be written"
+  local shell place half
+  for shell in bash zsh fish; do
+    case $shell in
+      bash) place=$2/share/bash-completion/completions/tce ;;
+      zsh) place=$2/share/zsh/site-functions/_tce ;;
+      fish) place=$2/share/fish/vendor_completions.d/tce.fish ;;
+    esac
+    half=$(mktemp)
+    "$1" completions "$shell" > "$half" || fail "$1 completions $shell: failed"
+    install_file 644 "$half" "$place"
+    rm -f "$half"
+  done
+}
+
 # One episode in the simulator, by a program that must find its library by itself.
 try_out() {
   env -u TCE_MUJOCO_LIB -u LD_LIBRARY_PATH "$1" evaluate zoo:hopper-source-medium --env hopper --episodes 1 > /dev/null ||

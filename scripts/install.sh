@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
 # Builds tce and puts it in place: scripts/install.sh [PREFIX] [ARGUMENTS OF cargo build, such as --features vulkan]
-# makes PREFIX/bin/tce and PREFIX/lib/libmujoco.so.3.17.0 (default: ~/.local). Both may be moved, together.
+# makes PREFIX/bin/tce, PREFIX/lib/libmujoco.so.3.17.0, and manual pages and completions under PREFIX/share (default: ~/.local).
+# bin and lib may be moved, together.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/common.sh
 
 case ${1:-} in
   -h | --help)
-    sed -n '2,3s/^# //p' scripts/install.sh
+    sed -n '2,4s/^# //p' scripts/install.sh
     exit
     ;;
   -* | '') prefix=$HOME/.local ;;
@@ -27,6 +28,7 @@ program=$(metadata "m['target_directory']")/release/tce
 install_file 644 "$(library_of "$(uname -m)")" "$prefix/lib/$LIBRARY"
 install_file 755 "$program" "$prefix/bin/tce"
 try_out "$prefix/bin/tce"
+helps "$prefix/bin/tce" "$prefix"
 
 echo "$prefix/bin/tce, $prefix/lib/$LIBRARY"
 case :$PATH: in

@@ -62,6 +62,9 @@ strip=strip
 "$strip" "$work/$name/bin/tce"
 if [ "$arch" = "$here" ]; then
   try_out "$work/$name/bin/tce"
+  helps "$work/$name/bin/tce" "$work/$name"
+else
+  echo "warning: manual pages and completions are left out: $arch programs do not run here" >&2
 fi
 
 tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$(git log -1 --format=%ct)" -C "$work" -cf - "$name" |

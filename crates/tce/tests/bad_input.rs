@@ -94,7 +94,7 @@ fn wrong_calls_end_with_code_2() {
         assert_eq!(tce(dir, args).status.code(), Some(2), "{args:?}");
     }
     // Data that are simply not there are no wrong call.
-    let output = tce(dir, &["run", "ant-gravity:medium->expert"]);
+    let output = tce(dir, &["run", "ant-gravity-5/medium/expert"]);
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains("TCE_SHARED"));
 }
