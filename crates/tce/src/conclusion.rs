@@ -38,7 +38,7 @@ impl Scored {
 }
 
 /// The best of those that `fits`; those without a score cannot be compared.
-fn best<'a>(all: &'a [Scored], fits: impl Fn(&Scored) -> bool) -> Option<&'a Scored> {
+fn best(all: &[Scored], fits: impl Fn(&Scored) -> bool) -> Option<&Scored> {
     all.iter().filter(|s| !s.scores.is_empty() && fits(s)).max_by(|a, b| a.mean().total_cmp(&b.mean()))
 }
 

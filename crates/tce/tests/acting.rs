@@ -111,3 +111,39 @@ fn a_training_can_begin_with_the_networks_of_another() {
     assert_eq!(nothing.status.code(), Some(2));
     assert!(message(&nothing).contains("no checkpoint of a training here"), "{}", message(&nothing));
 }
+
+#[test]
+fn a_training_can_begin_with_an_actor_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let train = |out: &str, env: &str, more: &[&str]| {
+        let args = ["train-sac", env, "--steps", "300", "--out", out, "--from", "zoo:hopper-source-medium"];
+        let rest = ["--start", "60", "--batch", "32", "--evaluate-every", "100", "--episodes", "1"];
+        tce(dir.path(), &[&args[..], &rest, more].concat())
+    };
+    let returns = |policy: &str| {
+        let args = ["evaluate", policy, "--env", "hopper-morph", "--episodes", "3", "--sample"];
+        tce_json(dir.path(), &args)[0]["returns"].clone()
+    };
+    let actor = returns("zoo:hopper-source-medium");
+    // Critics that learn alone leave the policy what it was.
+    assert!(train("critics", "hopper-morph", &["--policy-start", "1000", "--critic-norm"]).status.success());
+    assert_eq!(returns("critics/hopper-morph-seed0/policy.safetensors"), actor);
+    assert!(train("both", "hopper-morph", &["--policy-lr", "0.01"]).status.success());
+    assert_ne!(returns("both/hopper-morph-seed0/policy.safetensors"), actor);
+    let settings = fs::read_to_string(dir.path().join("both/hopper-morph-seed0/settings.json")).unwrap();
+    assert!(settings.contains("zoo:hopper-source-medium") && settings.contains("policy_lr"), "{settings}");
+    // Actions are random ones where that is asked for, and only until the policy's first update.
+    let first_action = |place: &str| {
+        let place = dir.path().join(place).join("hopper-morph-seed0");
+        let mut files = fs::read_dir(place).unwrap().map(|e| e.unwrap().path());
+        let replay = files.find(|p| p.to_string_lossy().contains("replay-")).unwrap();
+        load(&replay, &LoadOptions::default()).unwrap().transitions.actions[..3].to_vec()
+    };
+    assert!(train("random", "hopper-morph", &["--explore", "1"]).status.success());
+    assert_eq!(first_action("critics"), first_action("both"));
+    assert_ne!(first_action("random"), first_action("both"));
+
+    let refused = train("ant", "ant-morph", &[]);
+    assert!(!refused.status.success() && message(&refused).contains("Choose a policy of this agent"));
+    assert_eq!(train("share", "hopper", &["--explore", "2"]).status.code(), Some(2));
+}
