@@ -208,9 +208,9 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_is_not_there_is_refused_with_what_is() {
+    fn a_name_that_is_not_there_is_refused_with_where_to_look() {
         let message = Exhibit::at(Path::new("zoo:frog")).unwrap_err().to_string();
-        assert!(message.contains("`frog`") && message.contains("it has"), "{message}");
+        assert!(message.contains("`frog`") && message.contains("tce zoo list"), "{message}");
         assert!(Exhibit::at(Path::new("frog.npz")).unwrap().is_none());
     }
 }
