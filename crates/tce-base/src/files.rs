@@ -57,11 +57,7 @@ impl FileError {
 /// What the system says, under the name `path`.
 pub fn ensure_writable(path: &Path) -> Result<(), FileError> {
     let whole = std::path::absolute(path).map_err(|e| FileError::new(path, "write", e))?;
-    let above = whole.ancestors().skip(1).find(|p| p.exists()).unwrap_or(Path::new("/"));
-    if !above.is_dir() {
-        return Err(FileError::new(path, "write", io::ErrorKind::NotADirectory.into()));
-    }
-    tempfile::tempfile_in(above).map(drop).map_err(|e| FileError::new(path, "write", e))
+    try_nearest(whole.parent().unwrap_or(&whole)).map_err(|e| FileError::new(path, "write", e))
 }
 
 /// [`ensure_writable`] for a folder that is filled: where it exists, it is its own place.
@@ -69,9 +65,16 @@ pub fn ensure_writable(path: &Path) -> Result<(), FileError> {
 /// # Errors
 /// As [`ensure_writable`]; if there is a file of that name.
 pub fn ensure_folder(path: &Path) -> Result<(), FileError> {
-    match path.exists() {
-        true => ensure_writable(&path.join("x")).map_err(|e| FileError::new(path, "write into", e.source)),
-        false => ensure_writable(path),
+    let action = if path.exists() { "write into" } else { "write" };
+    std::path::absolute(path).and_then(|whole| try_nearest(&whole)).map_err(|e| FileError::new(path, action, e))
+}
+
+/// Makes a temporary file in the first of `folder` and those above it that exists.
+fn try_nearest(folder: &Path) -> io::Result<()> {
+    let nearest = folder.ancestors().find(|p| p.exists()).unwrap_or(Path::new("/"));
+    match nearest.is_dir() {
+        true => tempfile::tempfile_in(nearest).map(drop),
+        false => Err(io::ErrorKind::NotADirectory.into()),
     }
 }
 

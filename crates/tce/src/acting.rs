@@ -305,10 +305,9 @@ impl Training {
         goal: Goal,
         device: &Device,
     ) -> Result<Self> {
-        if !directory.join("settings.json").exists() {
-            // Nothing is left behind by a training that cannot begin.
-            from.map(|from| Origin::of(from, settings.agent)).transpose()?;
-        }
+        // Before anything is written: a training that cannot begin leaves nothing behind.
+        let begins = !directory.join("ledger.json").exists();
+        let origin = from.filter(|_| begins).map(|from| Origin::of(from, settings.agent)).transpose()?;
         std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
         let lock = lock(directory)?;
         let path = directory.join("settings.json");
@@ -339,10 +338,10 @@ impl Training {
                 )));
             }
         } else {
-            settings.from = from.map(|from| Origin::of(from, settings.agent)).transpose()?;
+            settings.from.clone_from(&origin);
             write_json(&path, &settings)?;
         }
-        let origin = settings.from.clone().filter(|_| ledger.is_none());
+        let origin = origin.filter(|_| ledger.is_none());
         let ledger = ledger.unwrap_or_default();
         let (agent, streams) = (settings.agent, Streams::new(settings.seed));
         // Ant's contact slots, which are always 0.

@@ -3,9 +3,8 @@
 
 use crate::layers::Preset;
 use crate::output::mean_std;
+use crate::verdict::SURE;
 
-/// Standard errors of a difference that is more than seeds do.
-const SURE: f64 = 2.0;
 /// Learner seeds below which the spread between seeds is not known well enough to be believed.
 const FEW: usize = 3;
 

@@ -93,18 +93,22 @@ pub struct Behaviour {
 
 impl Table {
     fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
-        let Loaded { transitions, report, .. } = load(path, options)?;
-        tce_base::note!("{report}");
-        Ok(Self::new(transitions, path, sha256_file(&main_file(path))?))
+        let (loaded, hash) = Self::loaded(path, options)?;
+        Ok(Self::new(loaded.transitions, path, hash))
+    }
+
+    /// What is in the file, which is told, and the file's hash.
+    fn loaded(path: &Path, options: &LoadOptions) -> Result<(Loaded, String)> {
+        let loaded = load(path, options)?;
+        tce_base::note!("{}", loaded.report);
+        Ok((loaded, sha256_file(&main_file(path))?))
     }
 
     /// The rows of a file that are not the target's. `tce augment` writes those beside the generated ones, and a learner that takes half of
     /// every batch from the target would see them twice.
     fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
         let options = LoadOptions { all_columns: true, ..options.clone() };
-        let Loaded { transitions, report, columns } = load(path, &options)?;
-        tce_base::note!("{report}");
-        let hash = sha256_file(&main_file(path))?;
+        let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
         let bits = |t: &Transitions, i: usize| -> Vec<u32> {
             let parts = [t.observation(i), t.action(i), t.next_observation(i)];
             parts.into_iter().flatten().map(|x| x.to_bits()).collect()

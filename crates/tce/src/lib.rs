@@ -22,7 +22,6 @@ mod learning;
 mod methods;
 mod metrics;
 mod mixture;
-mod narrow;
 mod output;
 mod own;
 mod pipeline;

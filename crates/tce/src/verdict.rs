@@ -82,11 +82,15 @@ fn episodes(judged: &[Judged]) -> Vec<f64> {
     (0..n).map(|i| judged.iter().map(|j| j.returns[i]).sum::<f64>() / count).collect()
 }
 
+/// Mean and its standard error.
+fn mean_and_error(values: &[f64]) -> [f64; 2] {
+    let (mean, std) = mean_std(values);
+    [mean, std / (values.len().max(1) as f64).sqrt()]
+}
+
 /// Mean and standard error of the paired differences.
 fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
-    let differences: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
-    let (mean, std) = mean_std(&differences);
-    [mean, std / (differences.len().max(1) as f64).sqrt()]
+    mean_and_error(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>())
 }
 
 /// The verdict where there is no choice: one candidate with one policy.
@@ -152,7 +156,7 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
         name: candidates[k].name.clone(),
         floor: candidates[k].floor,
         imagined_return: mean(k),
-        standard_error: difference(&returns[k], &vec![0.0; returns[k].len()])[1],
+        standard_error: mean_and_error(&returns[k])[1],
         survival: of_seeds(k, &|j| j.survival),
         action_error: of_seeds(k, &|j| j.action_error),
         over_standard: over[k],

@@ -8,8 +8,7 @@ use tce_report::analysis::{Aggregate, Comparison, opening};
 use tce_report::{Analysis, Options, analyse};
 
 use crate::error::{Error, Result};
-use crate::narrow::wrapped;
-use crate::output::{Output, table};
+use crate::output::{Output, prose, table};
 use crate::study::of_directory;
 
 /// Arguments of `report`.
@@ -51,19 +50,19 @@ impl Report {
 
 fn render(written: &Written) -> String {
     let Written { files, analysis } = written;
-    let mut text = wrapped(&opening(analysis).join(" "), 0) + "\n\n";
+    let mut text = prose(&opening(analysis).join(" "), 0) + "\n\n";
     if let Some(c) = &analysis.comparison {
         text += &comparison(analysis, c);
     }
     let updates = analysis.recipes.updates().map_or_else(String::new, |u| format!(", {u} learner updates"));
-    text += &wrapped(&format!("preset {}{updates}", analysis.recipes.names()), 2);
+    text += &prose(&format!("preset {}{updates}", analysis.recipes.names()), 2);
     text.push('\n');
     for doubt in analysis.tables.iter().filter_map(|t| t.doubt.as_ref()) {
-        text += &wrapped(&format!("warning: {doubt}"), 2);
+        text += &prose(&format!("warning: {doubt}"), 2);
         text.push('\n');
     }
     for warning in &analysis.warnings {
-        text += &wrapped(&format!("warning: {}", warning.text), 2);
+        text += &prose(&format!("warning: {}", warning.text), 2);
         text.push('\n');
     }
     for file in files {
@@ -94,7 +93,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
     let scores = table(&header, scores);
     let mut text = format!(
         "{}\n{scores}\n",
-        wrapped(
+        prose(
             &format!(
                 "Normalised scores over {tasks} (0: a random policy, 100: an expert). IQM: interquartile mean, the mean of the middle half of \
                  the runs."
@@ -122,7 +121,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
             let header = ["method", "points", "P(higher)", &interval, "p", "finding"];
             text += &format!(
                 "{}\n{}\n",
-                wrapped(
+                prose(
                     &format!(
                         "Against the best baseline, {}. points: above it. P(higher): share of pairs of runs in which the method's is \
                          higher, 0.5 is no difference. p: how often chance alone does that.",

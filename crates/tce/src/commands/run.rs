@@ -113,10 +113,8 @@ impl Run {
             false => Some(self.verdict(&inputs, &rows, &configs[0].dynamics, device)?),
         };
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
-        let scored = |row: &Row| Scored {
-            name: row.title.clone(),
-            floor: row.floor,
-            scores: row.summary.scores.iter().flatten().copied().collect(),
+        let scored = |row: &Row| {
+            Scored::new(&row.title, row.floor, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
         };
         let recommended = verdict.as_ref().map(|v| v.verdict.method.as_str());
         let scored: Vec<_> = rows.iter().map(scored).collect();

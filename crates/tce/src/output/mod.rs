@@ -9,7 +9,7 @@ mod table;
 mod wrap;
 
 pub use table::{heading, list, mark_best, table};
-pub use wrap::break_line;
+pub use wrap::{break_line, prose};
 
 /// The form of the results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,6 +2,14 @@
 
 use console::measure_text_width;
 
+/// The columns of a terminal that nobody has widened.
+const PROSE: usize = 80;
+
+/// Sentences in lines of at most 80 columns; lines after the first begin with `indent` spaces.
+pub fn prose(text: &str, indent: usize) -> String {
+    break_line(text, indent, PROSE)
+}
+
 /// `text` with every line that is longer than `width` broken between words. A line of the form `  name   value` goes on below its value.
 /// Tables have their width already, and words (paths, say) stay whole.
 pub fn text(text: &str, width: usize) -> String {
@@ -62,6 +70,18 @@ mod tests {
             text("The clone stands unless another is ahead.", 24),
             "The clone stands unless\n  another is ahead."
         );
+    }
+
+    #[test]
+    fn prose_is_broken_at_spaces() {
+        let words = "word ".repeat(40);
+        let text = prose(&words, 2);
+        let lines: Vec<&str> = text.lines().collect();
+        // 16 words and 15 spaces are 79 characters; after the indent there is room for 15 words.
+        assert_eq!(lines.iter().map(|l| l.matches("word").count()).collect::<Vec<_>>(), [16, 15, 9]);
+        assert!(lines[1].starts_with("  word") && lines.iter().all(|l| l.len() <= PROSE));
+        assert_eq!(prose(&"x".repeat(100), 2), "x".repeat(100));
+        assert_eq!(prose("", 2), "");
     }
 
     #[test]

@@ -275,27 +275,29 @@ impl Manifest {
         }
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
-        let mut lacking: Vec<String> = Vec::new();
+        // What the data of a task are needed for: with as many source rows, or without a source.
+        let mut wanted = BTreeSet::new();
         for &task in &tasks {
             for &variant in &variants {
                 for Override { name, set } in overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
-                    let args = plan.header.data_of(task);
-                    if let Err(e) = ensure_data(task, &args, config.needs_source().then_some(config.source.rows)) {
-                        lacking.push(e.to_string());
-                    }
+                    wanted.insert((task, config.needs_source().then_some(config.source.rows)));
                     for seed in description.first_seed..description.first_seed + description.seeds {
                         plan.add_run(&mut known, task, variant, name, &config, seed);
                     }
                 }
             }
         }
-        lacking.sort();
-        lacking.dedup();
+        let lacks = |(task, rows): (Task, Option<usize>)| ensure_data(task, &plan.header.data_of(task), rows).err();
+        let lacking: BTreeSet<String> = wanted.into_iter().filter_map(lacks).map(|e| e.to_string()).collect();
         if !lacking.is_empty() {
-            return Err(Error::Failed(format!("{}: not all data can be had:\n{}", path.display(), lacking.join("\n"))));
+            return Err(Error::Failed(format!(
+                "{}: not all data can be had:\n{}",
+                path.display(),
+                lacking.into_iter().collect::<Vec<_>>().join("\n")
+            )));
         }
         Ok(plan.sorted())
     }

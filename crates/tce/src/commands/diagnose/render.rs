@@ -5,21 +5,20 @@ use std::path::PathBuf;
 use tce_diagnosis::advice::percent;
 use tce_diagnosis::{AtBound, Diagnosis, Reliability, Spread};
 
-use crate::narrow::wrapped;
-use crate::output::table;
+use crate::output::{prose, table};
 
 /// What to do with the rows, the figures behind it, and where the rest is.
 pub fn render(d: &Diagnosis, files: &[PathBuf]) -> String {
     let mut parts = Vec::new();
-    let mut advice = wrapped(&d.advice().to_string(), 0);
-    advice.extend(d.choice.iter().map(|c| format!("\n{}", wrapped(&c.sentence(), 0))));
+    let mut advice = prose(&d.advice().to_string(), 0);
+    advice.extend(d.choice.iter().map(|c| format!("\n{}", prose(&c.sentence(), 0))));
     parts.push(advice);
     parts.push(format!("{}, seed {}, {} generated rows behind every figure", d.of, d.seed, d.rows));
     parts.push(reach(d));
     parts.push(errors(d));
     parts.push(rest(d));
     parts.extend((!d.notes.is_empty()).then(|| {
-        let notes: Vec<String> = d.notes.iter().map(|n| wrapped(&format!("note: {n}"), 2)).collect();
+        let notes: Vec<String> = d.notes.iter().map(|n| prose(&format!("note: {n}"), 2)).collect();
         notes.join("\n")
     }));
     parts.push(files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join("\n"));
@@ -59,7 +58,7 @@ fn reach(d: &Diagnosis) -> String {
          reach. Rejected: by the filter, if there is one; good is its share of real target rows. Nearer than fresh: how often a generated row is nearer to a \
          training row than a held-out row is.",
     );
-    format!("{}\n{}", wrapped(&text, 0), table(&header, rows.chain([good])))
+    format!("{}\n{}", prose(&text, 0), table(&header, rows.chain([good])))
 }
 
 /// Errors over y_max, of kept rows and of rejected ones.
@@ -81,7 +80,7 @@ fn errors(d: &Diagnosis) -> String {
     let text = "Medians. Distance: to the nearest real state, in standard deviations; good is what other target episodes have, and larger \
                 is farther into the unknown. KL and reward model: how far models of few and of many target rows differ. Reward and step \
                 error: beside the simulator; a step error of 1 is a whole step.";
-    format!("{}\n{}", wrapped(text, 0), table(&header, rows.chain([good.collect()])))
+    format!("{}\n{}", prose(text, 0), table(&header, rows.chain([good.collect()])))
 }
 
 /// What is a sentence.
@@ -104,5 +103,5 @@ fn rest(d: &Diagnosis) -> String {
         )
     }));
     lines.extend(d.choice_by_simulator.as_ref().map(|c| format!("λ by the simulator: {c}")));
-    lines.iter().map(|l| wrapped(l, 2)).collect::<Vec<_>>().join("\n")
+    lines.iter().map(|l| prose(l, 2)).collect::<Vec<_>>().join("\n")
 }
