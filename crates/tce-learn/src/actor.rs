@@ -245,6 +245,12 @@ impl Actor {
         self.output(self.net.net(), s)
     }
 
+    /// π(·|s) with `hidden` applied to the output of every hidden layer.
+    pub fn forward_with(&self, s: Tensor<3>, hidden: impl FnMut(Tensor<3>) -> Tensor<3>) -> PolicyOutput {
+        let net = self.net.net();
+        self.head(net, net.mlp.forward_with(s, hidden))
+    }
+
     /// A network that follows the policy, at the policy for now; [`Actor::step_averaged`] moves it.
     pub fn follower(&self) -> Averaged<ActorNet> {
         Averaged::new(self.net.net())
@@ -261,7 +267,10 @@ impl Actor {
     }
 
     fn output(&self, net: &ActorNet, s: Tensor<3>) -> PolicyOutput {
-        let out = net.mlp.forward(s);
+        self.head(net, net.mlp.forward(s))
+    }
+
+    fn head(&self, net: &ActorNet, out: Tensor<3>) -> PolicyOutput {
         let log_std = net.log_std.as_ref().map(|p| p.val().clamp(FREE_LOG_STD_RANGE.0, FREE_LOG_STD_RANGE.1));
         if self.config.form != PolicyForm::TanhGaussian {
             return PolicyOutput { mean: out, pre_tanh: None, log_std };

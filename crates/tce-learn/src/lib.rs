@@ -16,6 +16,7 @@
 //! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
 //! | one-step predictions in both domains, to filter rows and to try policies by | [`dynamics`] |
+//! | what a policy is worth by the rows alone | [`mod@fitted_q`] |
 //! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
 pub mod actor;
@@ -31,6 +32,7 @@ pub mod deterministic;
 pub mod dmc;
 pub mod dynamics;
 mod error;
+pub mod fitted_q;
 pub mod igdf;
 pub mod import;
 pub mod iql;
@@ -67,6 +69,7 @@ pub use dara::{Dara, DaraConfig};
 pub use dmc::{Dmc, DmcConfig};
 pub use dynamics::{Domain, Dynamics, DynamicsConfig, Prediction, train_dynamics};
 pub use error::LearnError;
+pub use fitted_q::{FittedQConfig, FittedValue, PolicyActions, discounted_return, fitted_q};
 pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, rmse, train_labels};

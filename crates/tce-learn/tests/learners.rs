@@ -62,6 +62,58 @@ fn cloning_learns_a_linear_policy() {
     }
 }
 
+/// a = sin(3 x) / 2 + noise of .3, as a sampled behaviour has it; few rows.
+fn noisy_data() -> Arc<Transitions> {
+    let mut rng = Streams::new(5).stream("noisy");
+    let mut t = Transitions::new(1, 1);
+    for _ in 0..200 {
+        let x = rng.random_range(-1.0f32..1.0);
+        let noise = 0.3 * (rng.random_range(-1.0f32..1.0) + rng.random_range(-1.0f32..1.0));
+        t.push(&[x], &[(3.0 * x).sin() / 2.0 + noise], 0.0, &[x], false, true);
+    }
+    Arc::new(t)
+}
+
+#[test]
+fn dropout_keeps_a_clone_from_fitting_the_noise_of_its_rows() {
+    let data = noisy_data();
+    let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 64).unwrap();
+    let error = |dropout: f64| {
+        let actor = ActorConfig { hidden: vec![128, 128, 128], lr: 1e-3, ..ActorConfig::default() };
+        let mut bc = Bc::new(&buffer, &BcConfig { actor, dropout, ..BcConfig::default() }, 1500, &cpu()).unwrap();
+        run(&mut bc, &buffer, 1500);
+        let square = |policy: &Policy, x: f32| (action(policy, &[x])[0] - (3.0 * x).sin() / 2.0).powi(2);
+        let points: Vec<f32> = (-9..10).map(|k| k as f32 / 10.0).collect();
+        let policies = bc.policies();
+        let all = policies.iter().flat_map(|p| points.iter().map(|&x| square(p, x)));
+        (all.sum::<f32>() / (policies.len() * points.len()) as f32).sqrt()
+    };
+    let (without, with) = (error(0.0), error(0.2));
+    assert!(with < 0.9 * without && with < 0.12, "error to the noiseless behaviour: {without} without, {with} with");
+}
+
+#[test]
+fn dropout_is_a_members_own_and_a_training_with_it_resumes() {
+    let data = noisy_data();
+    let members = [member(1, &data, true), member(2, &data, true)];
+    let actor = ActorConfig { hidden: vec![16, 16], ..ActorConfig::default() };
+    let config = BcConfig { actor, dropout: 0.3, ensemble: 2, ..BcConfig::default() };
+    let new = |members: &[Member]| {
+        let buffer = Buffer::new(members.to_vec(), 32).unwrap();
+        (Bc::new(&buffer, &config, 20, &cpu()).unwrap(), buffer)
+    };
+    let ((mut whole, buffer), (mut one, own)) = (new(&members), new(&members[1..]));
+    go(&mut whole, &buffer, 0, 20);
+    go(&mut one, &own, 0, 20);
+    let (a, b) = (action(&whole.policies()[1], &[0.3]), action(&one.policies()[0], &[0.3]));
+    assert!((a[0] - b[0]).abs() < 1e-5, "{a:?} {b:?}");
+    let (mut first, mut second) = (new(&members).0, new(&members).0);
+    go(&mut first, &buffer, 0, 11);
+    second.restore(&first.state(), Path::new("state")).unwrap();
+    go(&mut second, &buffer, 11, 20);
+    assert_eq!(whole.state(), second.state());
+}
+
 #[test]
 fn a_member_equals_a_run_of_its_own_and_a_repetition_equals_itself() {
     let data = linear_data();

@@ -160,12 +160,19 @@ pub struct Mlp {
 impl Mlp {
     /// `[P, B, input]` → `[P, B, output]`; fewer input members are shared between neighbouring networks.
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
+        self.forward_with(x, |h| h)
+    }
+
+    /// The same with `hidden` applied to the output of every hidden layer: dropout, say.
+    pub fn forward_with(&self, x: Tensor<3>, mut hidden: impl FnMut(Tensor<3>) -> Tensor<3>) -> Tensor<3> {
+        let last = self.layers.len() - 1;
         self.layers.iter().enumerate().fold(x, |x, (k, layer)| {
             let y = layer.forward(x);
-            match self.norms.get(k) {
+            let y = match self.norms.get(k) {
                 Some(norm) => norm.forward(y),
                 None => y,
-            }
+            };
+            if k < last { hidden(y) } else { y }
         })
     }
 }

@@ -571,6 +571,7 @@ fn save_card(policy: &Policy, path: &Path, settings: &Settings, judged: &Judged)
         updates: judged.step.saturating_sub(settings.start) / settings.steps_per_update,
         batch: settings.batch,
         from: settings.from.as_ref().map(Origin::describe),
+        cloned_from: None,
         episodes: settings.episodes,
         mean: judged.mean,
         std: judged.std,

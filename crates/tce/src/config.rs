@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 use tce_data::{DensityOptions, ScoreTable};
 use tce_diffusion::{Process, Sampler, Schedule, Target, UntilDone};
 use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, IgdfConfig, IqlConfig, LabelConfig, LearnError,
-    MetaDtConfig, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, FittedQConfig, IgdfConfig, IqlConfig, LabelConfig,
+    LearnError, MetaDtConfig, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig,
+    Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -32,6 +33,10 @@ pub struct Config {
     // Runs that were done before there was this table used no learned dynamics.
     #[serde(default)]
     pub dynamics: DynamicsConfig,
+    /// Fitted Q evaluation, which shows what policies are worth where no simulator does.
+    // It decides nothing, so that a run's key names it only where it is not as usual.
+    #[serde(default, skip_serializing_if = "FittedQConfig::is_default")]
+    pub fitted_q: FittedQConfig,
     /// One network over whole rows, for `mixture.generated` = synther and dmc.
     pub joint: JointConfig,
     /// The data the policy is learned from.
@@ -597,6 +602,8 @@ impl Config {
             ("source.rows", self.source.rows),
             ("generator.batch", self.generator.batch),
             ("dynamics.batch", self.dynamics.batch),
+            ("fitted_q.batch", self.fitted_q.batch),
+            ("fitted_q.replicates", self.fitted_q.replicates),
             ("labels.training.batch", self.labels.training.batch),
             ("learner.batch", self.learner.batch),
             ("learner.steps", usize::try_from(self.learner.steps).unwrap_or(usize::MAX)),

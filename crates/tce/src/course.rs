@@ -113,6 +113,13 @@ impl<'a> Course<'a> {
         self.step("learned dynamics", dynamics.clone());
         self.step("verdict", dynamics);
     }
+
+    /// Fitted Q evaluation of `policies` policies.
+    pub fn fitted_q(&mut self, config: &Config, policies: usize) {
+        if config.fitted_q.steps > 0 {
+            self.step("fitted Q", json!([config.fitted_q, policies]));
+        }
+    }
 }
 
 /// What the step is called in which the policy of `name` is trained.

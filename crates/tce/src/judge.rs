@@ -11,15 +11,19 @@
 //! | survival | share of the steps of whole episodes that were reached |
 //! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
 //! | action error | RMSE of the policy's actions at target states against the behaviour's |
+//! | fitted Q | discounted return from the starts of the target's episodes, by [`tce_learn::fitted_q`]: no model of the dynamics |
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
+use tce_base::{Streams, sha256_hex};
 use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, nn_distances};
-use tce_learn::{Domain, Dynamics, DynamicsConfig, Learner, Policy, rmse, train_dynamics};
+use tce_learn::{
+    Domain, Dynamics, DynamicsConfig, FittedQConfig, FittedValue, Learner, Policy, PolicyActions, discounted_return,
+    fitted_q, rmse, train_dynamics,
+};
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::{Error, Result};
@@ -44,6 +48,8 @@ pub struct Judge {
     pub held_out: Vec<f64>,
     /// The stage with its files.
     pub stage: Stage,
+    root: PathBuf,
+    inputs: InputSpec,
     target: Arc<Transitions>,
     low: Vec<f32>,
     high: Vec<f32>,
@@ -114,6 +120,8 @@ impl Judge {
             dynamics,
             held_out,
             stage,
+            root: root.to_owned(),
+            inputs: inputs.spec(false),
             spacing: spacing(target),
             target: Arc::new(target.clone()),
             low,
@@ -193,9 +201,7 @@ impl Judge {
         let returns = returns.concat();
         let n = returns.len() as f64;
         let (mean, std) = mean_std(&returns);
-        let mut actions = vec![0.0; t.actions.len()];
-        policy.act(&t.observations, None, &mut actions);
-        self.actions.iter().for_each(|range| range.to_unit(&mut actions));
+        let actions = self.actions_at(policy, &t.observations);
         Ok(Judged {
             imagined_return: mean,
             standard_error: std / n.sqrt(),
@@ -204,6 +210,59 @@ impl Judge {
             action_error: rmse(&actions, &t.actions),
             returns,
         })
+    }
+}
+
+impl Judge {
+    /// The mean actions of a policy, in the box of the rows. A policy that remembers its episode acts as in a first state.
+    fn actions_at(&self, policy: &Policy, observations: &[f32]) -> Vec<f32> {
+        let mut actions = vec![0.0; observations.len() / self.target.obs_dim * self.target.act_dim];
+        policy.act(observations, None, &mut actions);
+        self.actions.iter().for_each(|range| range.to_unit(&mut actions));
+        actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
+        actions
+    }
+
+    /// What the policies are worth by fitted Q evaluation on the target's rows, as one stage.
+    ///
+    /// # Errors
+    /// If a file cannot be read or written, or the user interrupts.
+    pub fn values(&self, policies: &[Policy], config: &FittedQConfig, device: &Device) -> Result<Vec<FittedValue>> {
+        #[derive(Serialize)]
+        struct Spec<'a> {
+            inputs: &'a InputSpec,
+            policies: Vec<String>,
+            config: &'a FittedQConfig,
+        }
+        let t = &self.target;
+        let starts: Vec<usize> = t.episodes().iter().map(|e| e.start).collect();
+        let first: Vec<f32> = starts.iter().flat_map(|&i| t.observation(i).iter().copied()).collect();
+        let actions = |policy: &Policy| PolicyActions {
+            next: self.actions_at(policy, &t.next_observations),
+            start: self.actions_at(policy, &first),
+        };
+        let actions: Vec<_> = policies.iter().map(actions).collect();
+        let hash = |a: &PolicyActions| {
+            sha256_hex(&a.next.iter().chain(&a.start).flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
+        };
+        // Its actions at these rows are all that decides a policy's value.
+        let spec = Spec { inputs: &self.inputs, policies: actions.iter().map(hash).collect(), config };
+        tce_base::begin_step("fitted Q");
+        let stage = Stage::open(&self.root, "stages/fitted-q", &spec, device)?;
+        if let Some(values) = stage.summary()? {
+            return Ok(values);
+        }
+        let attempt = stage.attempt()?;
+        let mut checkpoints = attempt.checkpoints("fitted-q")?;
+        let values = fitted_q(t, &starts, &actions, config, Streams::new(0), &mut checkpoints, device)?;
+        let values = values.ok_or(Error::Interrupted)?;
+        attempt.finish(&[], &values)?;
+        Ok(values)
+    }
+
+    /// The discounted return of the target's episodes as they were logged, to hold fitted values against.
+    pub fn behaviour_value(&self, config: &FittedQConfig) -> f64 {
+        discounted_return(&self.target, config.discount)
     }
 }
 

@@ -15,7 +15,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::Progress;
-use tce_learn::Policy;
+use tce_learn::{FittedQConfig, FittedValue, Policy};
+use tce_nn::Device;
 
 use crate::error::{Error, Result};
 use crate::judge::{Judge, Judged};
@@ -56,6 +57,10 @@ pub struct Tried {
     /// RMSE of the actions at target states against the behaviour's, mean over the seeds; the box is 2 wide.
     #[serde(default)]
     pub action_error: f64,
+    /// Discounted return by fitted Q evaluation, mean over the seeds, and the greatest of their standard errors; none where it was not
+    /// asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fitted_q: Option<[f64; 2]>,
     /// Imagined return less that of the standard, and its standard error.
     pub over_standard: [f64; 2],
 }
@@ -73,6 +78,9 @@ pub struct Verdict {
     pub reason: String,
     /// All candidates, as they were given.
     pub tried: Vec<Tried>,
+    /// The discounted return of the target's episodes as they were logged; none where no policy has a fitted one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub behaviour_value: Option<f64>,
 }
 
 /// Mean over the seeds of every imagined episode's return.
@@ -98,14 +106,26 @@ pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
     let [Candidate { name, files, .. }] = candidates else { return None };
     let [policy] = &files[..] else { return None };
     let reason = format!("{name} is the only policy there is.");
-    Some(Verdict { method: name.clone(), policy: policy.clone(), sure: true, reason, tried: Vec::new() })
+    Some(Verdict {
+        method: name.clone(),
+        policy: policy.clone(),
+        sure: true,
+        reason,
+        tried: Vec::new(),
+        behaviour_value: None,
+    })
 }
 
-/// Tries all candidates in learned dynamics and recommends one.
+/// Tries all candidates in learned dynamics and recommends one. With `fitted_q` their policies are evaluated by fitted Q, too: those
+/// figures are shown and decide nothing, because they do not rank policies (bench/expansion.md).
 ///
 /// # Errors
 /// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
-pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]) -> Result<Verdict> {
+pub fn recommend(
+    judge: impl FnOnce() -> Result<Judge>,
+    candidates: &[Candidate],
+    fitted_q: Option<(&FittedQConfig, &Device)>,
+) -> Result<Verdict> {
     let judge = judge()?;
     tce_base::begin_step("verdict");
     let progress = Progress::new("try policies", candidates.iter().map(|c| c.files.len() as u64).sum(), "policies");
@@ -113,7 +133,19 @@ pub fn recommend(judge: impl FnOnce() -> Result<Judge>, candidates: &[Candidate]
     let try_all = |c: &Candidate| c.files.iter().map(try_one).collect::<Result<Vec<_>>>();
     let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
     progress.finish();
-    decide(candidates, &judged)
+    let mut verdict = decide(candidates, &judged)?;
+    if let Some((config, device)) = fitted_q {
+        let policies = candidates.iter().flat_map(|c| &c.files).map(|f| Ok(Policy::load(f)?));
+        let values = judge.values(&policies.collect::<Result<Vec<_>>>()?, config, device)?;
+        let mut values = values.iter();
+        for (tried, candidate) in verdict.tried.iter_mut().zip(candidates) {
+            let own: Vec<&FittedValue> = values.by_ref().take(candidate.files.len()).collect();
+            let mean = mean_std(&own.iter().map(|v| v.mean()).collect::<Vec<_>>()).0;
+            tried.fitted_q = Some([mean, own.iter().map(|v| v.standard_error()).fold(0.0, f64::max)]);
+        }
+        verdict.behaviour_value = Some(judge.behaviour_value(config));
+    }
+    Ok(verdict)
 }
 
 fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
@@ -159,6 +191,7 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
         standard_error: mean_and_error(&returns[k])[1],
         survival: of_seeds(k, &|j| j.survival),
         action_error: of_seeds(k, &|j| j.action_error),
+        fitted_q: None,
         over_standard: over[k],
     };
     Ok(Verdict {
@@ -167,6 +200,7 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
         sure: gap.is_none_or(|[by, error]| by > SURE * error),
         reason,
         tried: (0..candidates.len()).map(tried).collect(),
+        behaviour_value: None,
     })
 }
 

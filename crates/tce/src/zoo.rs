@@ -1,4 +1,4 @@
-//! The zoo: actors that this very program trained, shipped inside it, with a card each.
+//! The zoo: actors that this very program trained, by SAC or by cloning, shipped inside it, with a card each.
 //!
 //! An actor is a safetensors file in half precision under `crates/tce/zoo`, named `AGENT-SHIFT-ROLE`. Wherever a policy's file is
 //! asked for, `zoo:NAME` stands for one of them. Roles are `medium` and `expert` (D4RL's returns in the source domain, OTDF's
@@ -41,6 +41,9 @@ pub struct Card {
     pub batch: usize,
     /// The training whose networks this one began with.
     pub from: Option<String>,
+    /// The rows whose behaviour it was cloned from; none for SAC.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cloned_from: Option<String>,
     /// Episodes with sampled actions behind the next figures.
     pub episodes: usize,
     /// Mean return.
@@ -56,6 +59,27 @@ pub struct Card {
 }
 
 impl Card {
+    /// The card of a clone of the rows that `cloned_from` describes, before anyone has judged it.
+    pub fn of_clone(agent: Agent, shift: Shift, cloned_from: String, seed: u64, updates: u64, batch: usize) -> Self {
+        Self {
+            agent,
+            shift,
+            role: None,
+            seed,
+            steps: 0,
+            updates,
+            batch,
+            from: None,
+            cloned_from: Some(cloned_from),
+            episodes: 0,
+            mean: f64::NAN,
+            std: f64::NAN,
+            length: f64::NAN,
+            score: None,
+            program: crate::PROGRAM.into(),
+        }
+    }
+
     /// The card in a policy file, if it has one.
     ///
     /// # Errors

@@ -28,6 +28,7 @@ const SMALL: &[&str] = &[
     "--set=evaluation.episodes=2",
     "--set=evaluation.every=150",
     "--set=dynamics.steps=20",
+    "--set=fitted_q.steps=20",
 ];
 
 /// The program at work, with a checkpoint at every opportunity.
@@ -289,6 +290,7 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
                 "--set=learner.batch=32",
                 "--set=learner.iql.regulariser=none",
                 "--set=dynamics.steps=20",
+                "--set=fitted_q.steps=20",
             ],
         ]
         .concat()

@@ -49,12 +49,23 @@ fn without_mujoco_data_are_checked_and_learned_from() {
     let program = copied_to(&dir.path().join("elsewhere"));
     let (source, target) = data_pair(program.parent().unwrap(), Agent::Hopper, Shift::Morph);
     let (source, target) = (source.to_str().unwrap(), target.to_str().unwrap());
-    let short = ["--set", "learner.steps=20", "--set", "dynamics.steps=20"];
+    let short = ["--set", "learner.steps=20", "--set", "dynamics.steps=20", "--set", "fitted_q.steps=20"];
     let learn: &[&str] = &["learn", "--learner", "bc", "--source", source, "--target", target, "--out", "policy"];
     for args in [
         &["data", "check", target][..],
         &[learn, &short].concat(),
-        &["judge", "policy/policy.safetensors", "--source", source, "--target", target, "--dynamics-steps", "20"],
+        &[
+            "judge",
+            "policy/policy.safetensors",
+            "--source",
+            source,
+            "--target",
+            target,
+            "--dynamics-steps",
+            "20",
+            "--fitted-q-steps",
+            "0",
+        ],
         &["zoo", "list"],
         &["config", "show"],
     ] {

@@ -122,8 +122,19 @@ fn torques_stay_torques() {
     assert!(actions.iter().all(|a| a.abs() <= 20.0) && actions.iter().any(|a| a.abs() > 1.0), "{actions:?}");
     let wide = learn("wide", &["--action-range", "-25:25"]);
     assert_eq!(wide.action_range().unwrap().high, [25.0; 2]);
-    let output =
-        tce(dir, &["judge", "policy/policy-seed0.safetensors", "--target", "target.hdf5", "--dynamics-steps", "20"]);
+    let output = tce(
+        dir,
+        &[
+            "judge",
+            "policy/policy-seed0.safetensors",
+            "--target",
+            "target.hdf5",
+            "--dynamics-steps",
+            "20",
+            "--fitted-q-steps",
+            "20",
+        ],
+    );
     assert!(output.status.success(), "{}", message(&output));
 }
 
@@ -206,7 +217,7 @@ fn little_and_constant_targets_are_used_or_refused_in_words() {
         assert!(!text.contains("panicked"), "{name}: {text}");
         assert!(output.status.success() || text.contains("expected"), "{name}: {text}");
         let learn = ["learn", "--target", "target.hdf5", "--learner", "bc", "--out", name, "--set=learner.steps=5"];
-        let output = tce(dir.path(), &[&learn[..], &["--set=dynamics.steps=5"]].concat());
+        let output = tce(dir.path(), &[&learn[..], &["--set=dynamics.steps=5", "--set=fitted_q.steps=5"]].concat());
         let text = message(&output);
         assert!(!text.contains("panicked"), "{name}: {text}");
         assert!(output.status.success() || text.contains("expected"), "{name}: {text}");

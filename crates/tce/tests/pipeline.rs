@@ -309,7 +309,8 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     assert!(recommended == fs::read(dir.path().join(verdict["policy"].as_str().unwrap())).unwrap());
     assert!(verdict["reason"].as_str().unwrap().contains("is recommended"), "{verdict}");
     let both = ["policy/policy-seed0.safetensors", "policy/policy.safetensors"];
-    let judge = ["--source", "source.hdf5", "--target", "target.hdf5", "--dynamics-steps", "20"];
+    let judge =
+        ["--source", "source.hdf5", "--target", "target.hdf5", "--dynamics-steps", "20", "--fitted-q-steps", "0"];
     let judged = tce_json(dir.path(), &[&["judge"][..], &both, &judge].concat());
     assert!(judged["policies"].as_array().unwrap().len() == 2 && judged["held_out"][0].is_number(), "{judged}");
     assert_eq!(judged["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
@@ -347,7 +348,7 @@ fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
         args.extend(["--env", "hopper-morph", "--seeds", "2", "--out", out, "--threads", threads]);
         args.extend(["--set", "learner.steps=20", "--set", "learner.meta_dt.world_model.steps=10"]);
         args.extend(["--set", "learner.meta_dt.embed=16", "--set", "evaluation.episodes=2"]);
-        args.extend(["--set", "dynamics.steps=20"]);
+        args.extend(["--set", "dynamics.steps=20", "--set", "fitted_q.steps=20"]);
         tce_json(dir.path(), &args)
     };
     let learned = learn("one", "1");

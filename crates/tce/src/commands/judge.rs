@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_learn::{DynamicsConfig, Policy};
+use tce_learn::{DynamicsConfig, FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
 
 use crate::error::{Error, Result};
@@ -28,6 +28,9 @@ pub struct JudgeArgs {
     /// Updates of the learned dynamics.
     #[arg(long, default_value_t = DynamicsConfig::default().steps, value_name = "STEPS")]
     dynamics_steps: u64,
+    /// Updates of fitted Q evaluation, a second opinion on the policies; 0: none.
+    #[arg(long, default_value_t = FittedQConfig::default().steps, value_name = "STEPS")]
+    fitted_q_steps: u64,
     /// Where the learned dynamics are kept, for a second call.
     #[arg(long, default_value = "runs")]
     cache: PathBuf,
@@ -39,6 +42,8 @@ pub struct JudgeArgs {
 struct Report {
     /// Median and 95th percentile of the errors of the learned dynamics on held-out target rows, in steps.
     held_out: [f64; 2],
+    /// The discounted return of the target's episodes as they were logged.
+    behaviour_value: f64,
     policies: Vec<Line>,
 }
 
@@ -47,6 +52,8 @@ struct Line {
     policy: PathBuf,
     #[serde(flatten)]
     judged: Judged,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fitted_q: Option<FittedValue>,
 }
 
 impl JudgeArgs {
@@ -69,12 +76,23 @@ impl JudgeArgs {
         let policies = self.policies.iter().map(load).collect::<Result<Vec<_>>>()?;
         let config = DynamicsConfig { steps: self.dynamics_steps, ..DynamicsConfig::default() };
         let judge = Judge::train(&inputs, &config, &self.cache, device)?;
-        let lines = self.policies.iter().zip(&policies);
-        let lines = lines.map(|(path, policy)| Ok(Line { policy: path.clone(), judged: judge.judge(policy)? }));
+        let fitted_q = FittedQConfig { steps: self.fitted_q_steps, ..FittedQConfig::default() };
+        let values = match fitted_q.steps {
+            0 => vec![None; policies.len()],
+            _ => judge.values(&policies, &fitted_q, device)?.into_iter().map(Some).collect(),
+        };
+        let lines = self.policies.iter().zip(&policies).zip(values);
+        let lines = lines.map(|((path, policy), fitted_q)| {
+            Ok(Line { policy: path.clone(), judged: judge.judge(policy)?, fitted_q })
+        });
         let at = |q: f64| {
             judge.held_out.get(((judge.held_out.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(f64::NAN)
         };
-        let report = Report { held_out: [at(0.5), at(0.95)], policies: lines.collect::<Result<Vec<_>>>()? };
+        let report = Report {
+            held_out: [at(0.5), at(0.95)],
+            behaviour_value: judge.behaviour_value(&fitted_q),
+            policies: lines.collect::<Result<Vec<_>>>()?,
+        };
         output.print(&report, render);
         Ok(())
     }
@@ -88,14 +106,17 @@ fn render(report: &Report) -> String {
             format!("{:.0} ± {:.0}", j.imagined_return, j.standard_error),
             format!("{:.0} %", 100.0 * j.survival),
             format!("{:.2}", j.distance),
+            l.fitted_q.as_ref().map_or("-".into(), |v| format!("{:.1} ± {:.1}", v.mean(), v.standard_error())),
             format!("{:.3}", j.action_error),
         ]
     });
-    let header = ["policy", "imagined return", "survival", "distance", "action error"];
+    let header = ["policy", "imagined return", "survival", "distance", "fitted Q", "action error"];
     format!(
-        "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n{}",
+        "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n{}\n\
+         fitted Q: return with each later reward worth 1 % less; the target's logged episodes have {:.1}",
         report.held_out[0],
         report.held_out[1],
-        table(&header, rows)
+        table(&header, rows),
+        report.behaviour_value
     )
 }

@@ -164,7 +164,8 @@ impl Learn {
                 let candidates: Vec<_> = floor.into_iter().chain([own]).collect();
                 // Without a simulator a single policy is tried, too: nothing else tells what it is worth.
                 let alone = self.own.env.and_then(|_| only(&candidates));
-                let verdict = alone.map_or_else(|| recommend(judge, &candidates), Ok)?;
+                let fitted_q = (config.fitted_q.steps > 0).then_some((&config.fitted_q, device));
+                let verdict = alone.map_or_else(|| recommend(judge, &candidates, fitted_q), Ok)?;
                 Some(keep(verdict, &out)?)
             }
         };
@@ -187,6 +188,7 @@ impl Learn {
                 course.learning(FLOOR, &Config { learner: floor_learner(config), ..config.clone() }, false);
             }
             course.verdict(config);
+            course.fitted_q(config, seeds * if mixed { 2 } else { 1 });
         }
         course.plan();
     }
@@ -274,14 +276,21 @@ fn render(report: &Report) -> String {
                 if t.floor { format!("{} (baseline)", t.name) } else { t.name.clone() },
                 format!("{:.1} ± {:.1}", t.imagined_return, t.standard_error),
                 format!("{:.0} %", 100.0 * t.survival),
+                t.fitted_q.map_or("-".into(), |[value, error]| format!("{value:.1} ± {error:.1}")),
                 format!("{:.3}", t.action_error),
             ]
         });
-        let header = ["policy", "imagined return", "of an episode survived", "action error"];
+        let logged = kept.verdict.behaviour_value.map(|value| {
+            let name = "the target's logged episodes".to_owned();
+            [name, "-".into(), "-".into(), format!("{value:.1}"), "0".into()]
+        });
+        let header = ["policy", "imagined return", "of an episode survived", "fitted Q", "action error"];
         text += &format!(
-            "\nTried in learned dynamics of the robot, no simulator needed (± standard error):\n{}\n\
+            "\nEstimated without a simulator (± standard error):\n{}\n\
+             imagined return: of episodes in learned dynamics of the robot\n\
+             fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
              action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n\n{}",
-            table(&header, rows),
+            table(&header, rows.chain(logged)),
             kept.sentences()
         );
     }

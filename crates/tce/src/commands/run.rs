@@ -147,7 +147,7 @@ impl Run {
         let judge = || Judge::train(inputs, dynamics, &self.data.out, device);
         let candidates: Vec<_> = rows.iter().map(candidate).collect();
         // The simulator has judged a single policy already.
-        let verdict = only(&candidates).map_or_else(|| recommend(judge, &candidates), Ok)?;
+        let verdict = only(&candidates).map_or_else(|| recommend(judge, &candidates, None), Ok)?;
         keep(verdict, &self.data.out.join(self.task.directory()))
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_base::{Streams, interrupted, write_atomically};
-use tce_data::ScoreTable;
+use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
 
@@ -53,8 +53,23 @@ pub struct Rollout {
 /// Arguments of `zoo keep`.
 #[derive(Debug, Args)]
 pub struct Keep {
-    /// A policy written by `tce train-sac`.
+    /// A policy written by `tce train-sac`; or a clone made by `tce learn`, with the next three options.
     policy: PathBuf,
+    /// The domain of a clone, whose file does not name it: hopper-kinematic.
+    #[arg(long, value_parser = parse_environment, requires = "cloned_from")]
+    env: Option<(Agent, Shift)>,
+    /// The rows whose behaviour was cloned, in words for the card.
+    #[arg(long, requires_all = ["env", "updates"])]
+    cloned_from: Option<String>,
+    /// Updates of a clone.
+    #[arg(long, requires = "cloned_from")]
+    updates: Option<u64>,
+    /// Rows per update of a clone.
+    #[arg(long, default_value_t = 256, requires = "cloned_from")]
+    batch: usize,
+    /// Seed of a clone.
+    #[arg(long, default_value_t = 0, requires = "cloned_from")]
+    seed: u64,
     /// What it is kept for: medium, expert, or stage-N.
     #[arg(long)]
     role: String,
@@ -141,13 +156,21 @@ fn show(s: &Shown) -> String {
         ("return", format!("{:.1} ± {:.1} over {} episodes with sampled actions", c.mean, c.std, c.episodes)),
         ("length", format!("{:.1}", c.length)),
         ("score", s.score()),
-        ("training", format!("SAC, seed {}, {} steps, {} updates of {} rows", c.seed, c.steps, c.updates, c.batch)),
+        ("training", training(c)),
         ("began with", began),
         ("trained by", c.program.clone()),
         ("file", format!("{} bytes, SHA-256 {}", s.bytes, s.sha256)),
         ("use it as", format!("zoo:{}", s.name)),
     ];
     rows.iter().fold(format!("{}\n", s.name), |text, (name, value)| text + &format!("  {name:<14} {value}\n"))
+}
+
+fn training(c: &Card) -> String {
+    let Card { seed, steps, updates, batch, .. } = c;
+    match &c.cloned_from {
+        None => format!("SAC, seed {seed}, {steps} steps, {updates} updates of {batch} rows"),
+        Some(rows) => format!("behaviour cloning of {rows}, seed {seed}, {updates} updates of {batch} rows"),
+    }
 }
 
 impl Rollout {
@@ -190,6 +213,26 @@ fn judge(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: 
 }
 
 impl Keep {
+    /// What is known of the policy before it is judged.
+    fn card(&self, parameters: &NamedParameters) -> Result<Card> {
+        let written = Card::of(parameters, &self.policy)?;
+        let (Some((agent, shift)), Some(rows)) = (self.env, &self.cloned_from) else {
+            return written.ok_or_else(|| {
+                let path = self.policy.display();
+                Error::Usage(format!(
+                    "{path}: has no card; give a policy written by `tce train-sac`, or say what it is with --env, \
+                     --cloned-from and --updates"
+                ))
+            });
+        };
+        if written.is_some() {
+            let path = self.policy.display();
+            return Err(Error::Usage(format!("{path}: has a card of its own; leave out --env and --cloned-from")));
+        }
+        let updates = self.updates.unwrap_or_default();
+        Ok(Card::of_clone(agent, shift, rows.clone(), self.seed, updates, self.batch))
+    }
+
     fn run(self, output: Output) -> Result<()> {
         let stage = self.role.strip_prefix("stage-").is_some_and(|n| n.parse::<u32>().is_ok());
         if !(stage || self.role == "medium" || self.role == "expert") {
@@ -200,9 +243,7 @@ impl Keep {
         }
         tce_sim::open_library()?;
         let full = NamedParameters::load(&self.policy)?;
-        let card = Card::of(&full, &self.policy)?.ok_or_else(|| {
-            Error::Usage(format!("{}: has no card; give a policy written by `tce train-sac`", self.policy.display()))
-        })?;
+        let card = self.card(&full)?;
         // What is judged is what will be read back.
         let mut parameters = full.to_half();
         let policy = Policy::from_parameters(&parameters, &self.policy)?;

@@ -132,4 +132,6 @@ pub const TINY: &[&str] = &[
     "joint.width=32",
     "--set",
     "dynamics.steps=20",
+    "--set",
+    "fitted_q.steps=20",
 ];
