@@ -7,14 +7,14 @@ use clap::Args;
 use serde::Serialize;
 use tce_data::Transitions;
 use tce_nn::Device;
+use tce_run::course::Course;
+use tce_run::error::Result;
+use tce_run::expand::{Generated, expand};
+use tce_run::inputs::Inputs;
+use tce_run::layers::ConfigArgs;
+use tce_run::own::{Own, Writing};
 
-use crate::course::Course;
-use crate::error::Result;
-use crate::expand::{Generated, expand};
-use crate::inputs::Inputs;
-use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::own::{Own, Writing};
 
 /// Arguments of `augment`.
 #[derive(Debug, Args)]
@@ -85,7 +85,7 @@ impl Augment {
             ("target_sha256".to_owned(), inputs.target.hash.clone()),
             ("seed".to_owned(), self.seed.to_string()),
             ("config".to_owned(), config.to_toml()),
-            ("program".to_owned(), crate::PROGRAM.to_owned()),
+            ("program".to_owned(), tce_base::PROGRAM.to_owned()),
         ]);
         self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };

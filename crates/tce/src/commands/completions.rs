@@ -2,8 +2,7 @@
 
 use clap::Args;
 use clap_complete::Shell;
-
-use crate::error::Result;
+use tce_run::error::Result;
 
 /// Arguments of `completions`.
 #[derive(Debug, Args)]

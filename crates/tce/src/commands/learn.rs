@@ -5,24 +5,24 @@ use std::sync::Arc;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use tce_base::{read_if_there, sha256_hex};
+use tce_base::{plus_minus, read_if_there, sha256_hex};
 use tce_data::ScoreTable;
 use tce_nn::Device;
+use tce_run::config::{Algorithm, Config, LearnerConfig};
+use tce_run::course::{Course, learning};
+use tce_run::error::{Error, Result};
+use tce_run::inputs::{Inputs, Table};
+use tce_run::judge::Judge;
+use tce_run::layers::ConfigArgs;
+use tce_run::learning::{Learned, MemberData, learn, save_policies};
+use tce_run::methods::{Method, row_scores};
+use tce_run::own::Own;
+use tce_run::pipeline::seeds;
+use tce_run::processor::Processor;
+use tce_run::verdict::{Candidate, Kept, keep, only, recommend};
+use tce_zoo::actors::Arena;
 
-use crate::actors::Arena;
-use crate::config::{Algorithm, Config, LearnerConfig};
-use crate::course::{Course, learning};
-use crate::error::{Error, Result};
-use crate::inputs::{Inputs, Table};
-use crate::judge::Judge;
-use crate::layers::ConfigArgs;
-use crate::learning::{Learned, MemberData, learn, save_policies};
-use crate::methods::{Method, row_scores};
-use crate::output::{Output, list as listed, plus_minus, table};
-use crate::own::Own;
-use crate::pipeline::seeds;
-use crate::processor::Processor;
-use crate::verdict::{Candidate, Kept, keep, only, recommend};
+use crate::output::{Output, list as listed, table};
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -100,7 +100,7 @@ impl Learn {
                 method.name
             )));
         }
-        if self.extra.is_none() && method.needs == crate::methods::SOURCE_ROWS {
+        if self.extra.is_none() && method.needs == tce_run::methods::SOURCE_ROWS {
             return Err(Error::Usage(format!(
                 "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
                 method.name

@@ -4,8 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use tce_base::{FileError, write_atomically};
-
-use crate::error::Result;
+use tce_run::error::Result;
 
 /// Arguments of `man`.
 #[derive(Debug, Args)]

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use clap::{FromArgMatches, Parser, Subcommand};
 use tce_base::{ensure_folder, ensure_writable};
+use tce_run::error::{Error, Result};
+use tce_run::processor::Processor;
 
-use crate::error::{Error, Result};
 use crate::output::{Form, Output};
-use crate::processor::Processor;
 
 mod augment;
 mod bench;
@@ -142,7 +142,7 @@ impl Cli {
 
 /// Refuses a folder for results that cannot be written, or that lies in a sweep's, whose files are all accounted for.
 fn refuse_folder(out: &Path) -> Result<()> {
-    match crate::sweep::around(&out.join("x")) {
+    match tce_run::sweep::around(&out.join("x")) {
         Some(sweep) => Err(Error::Usage(format!(
             "--out {}: found the folder of a sweep, {}; what lies there is the sweep's own. Choose another folder",
             out.display(),

@@ -8,16 +8,16 @@ use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
+use tce_run::diagnosis::cycles::{AtCycle, Cycles, cycles};
+use tce_run::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
+use tce_run::error::Result;
+use tce_run::expand::{Finisher, label_models};
+use tce_run::generator::Generator;
+use tce_run::inputs::{DataArgs, Inputs};
+use tce_run::layers::ConfigArgs;
+use tce_run::variant::Variant;
 
-use crate::diagnosis::cycles::{AtCycle, Cycles, cycles};
-use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
-use crate::error::Result;
-use crate::expand::{Finisher, label_models};
-use crate::generator::Generator;
-use crate::inputs::{DataArgs, Inputs};
-use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::variant::Variant;
 
 /// Arguments of `generator`.
 #[derive(Debug, Args)]
@@ -149,8 +149,8 @@ impl GeneratorArgs {
         let mut rows = Vec::new();
         let mut floors = None;
         for process in processes {
-            let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
-            let varied = crate::config::Config { generator: generator_config.clone(), ..config.clone() };
+            let generator_config = tce_run::config::GeneratorConfig { process, ..config.generator.clone() };
+            let varied = tce_run::config::Config { generator: generator_config.clone(), ..config.clone() };
             let (generator, ..) = Generator::train(&inputs, &varied, &seeds, &self.data.out, device)?;
             let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
             if floors.is_none() {

@@ -9,16 +9,16 @@ use tce_data::Task;
 use tce_diagnosis::Diagnosis;
 use tce_learn::TransitionConfig;
 use tce_nn::Device;
+use tce_run::config::Config;
+use tce_run::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
+use tce_run::error::{Error, Result};
+use tce_run::inputs::{DataArgs, Inputs};
+use tce_run::layers::ConfigArgs;
+use tce_run::own::Own;
+use tce_run::study::task_of;
+use tce_run::variant::Variant;
 
-use crate::config::Config;
-use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
-use crate::error::{Error, Result};
-use crate::inputs::{DataArgs, Inputs};
-use crate::layers::ConfigArgs;
 use crate::output::Output;
-use crate::own::Own;
-use crate::study::task_of;
-use crate::variant::Variant;
 
 mod generator;
 mod render;

@@ -1,0 +1,598 @@
+//! The two data sets of a run: found, loaded, and refused together if they do not fit.
+
+use std::borrow::Cow;
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use tce_base::sha256_file;
+use tce_data::{
+    ActionRange, Agent, Choice, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Standardizer, Task,
+    Transitions, choose_trajectories, ensure_same_agent, infer_agents, load, main_file, reference_scores,
+};
+use tce_sim::EPISODE_LIMIT;
+use tce_zoo::actors::{Cast, Recipe};
+use tce_zoo::exhibits;
+use tce_zoo::stand_ins::{self, shared_folder};
+
+use crate::config::{Algorithm, Config, LearnerConfig, TargetConfig, Trajectories};
+use crate::error::{Error, Result};
+use crate::own::{Own, range_of};
+
+/// Below this, nothing can be held out and nothing be learned.
+const LEAST_ROWS: usize = 10;
+
+/// The files of a benchmark task, and where results go.
+#[derive(Clone, Debug, clap::Args)]
+#[command(next_help_heading = "Data")]
+pub struct DataArgs {
+    /// Source data (default: collected from the zoo's actors, or from those in TCE_SHARED where the zoo lacks one).
+    #[arg(long, value_name = "FILE")]
+    pub source: Option<PathBuf>,
+    /// Target data (default: OTDF's public file if TCE_SHARED has it, otherwise collected from the zoo's actors).
+    #[arg(long, value_name = "FILE")]
+    pub target: Option<PathBuf>,
+    /// Do not look into TCE_SHARED: what is not given as a file is collected from the zoo.
+    #[arg(long)]
+    pub from_zoo: bool,
+    /// Where results and finished stages are kept.
+    #[arg(long, default_value = "runs")]
+    pub out: PathBuf,
+}
+
+/// Source and target, and what is known about where they come from.
+#[derive(Debug)]
+pub struct Inputs {
+    /// The robot, where it is one of the benchmark's.
+    pub agent: Option<Agent>,
+    /// The target's shift, where the simulator can be used for it.
+    pub shift: Option<Shift>,
+    /// Target rows.
+    pub target: Table,
+    /// Source rows; variants that do not look at them can do without.
+    pub source: Option<Table>,
+    /// Rows of a third file, to learn from.
+    pub extra: Option<Table>,
+    /// The units of the files' actions, where they are not the box [-1, 1]. The tables are in the box.
+    pub actions: Option<ActionRange>,
+    /// The collector's step limit, where the user gave one.
+    limit: Option<usize>,
+}
+
+/// A loaded file.
+#[derive(Debug)]
+pub struct Table {
+    /// The rows whose successor is known.
+    pub rows: Transitions,
+    /// All rows, where there are terminal ones without a successor among them.
+    complete: Option<Transitions>,
+    /// All rows' actions as the file has them, where they were scaled.
+    own_actions: Option<Vec<f32>>,
+    /// The file.
+    pub file: PathBuf,
+    /// SHA-256 of the file, and how many of its rows these are, if not all.
+    pub hash: String,
+}
+
+/// What a data set is, and how good the policy was that collected it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Behaviour {
+    /// The file.
+    pub file: PathBuf,
+    /// Its rows.
+    pub rows: usize,
+    /// Whole episodes.
+    pub episodes: usize,
+    /// Their mean return.
+    pub mean: f64,
+    /// The spread of their returns.
+    pub std: f64,
+    /// The mean return, normalised in the domain that the rows come from; None if no episode came to its end.
+    pub score: Option<f64>,
+}
+
+impl Table {
+    fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
+        let (loaded, hash) = Self::loaded(path, options)?;
+        Ok(Self::new(loaded.transitions, path, hash))
+    }
+
+    /// What is in the file, which is told, and the file's hash.
+    fn loaded(path: &Path, options: &LoadOptions) -> Result<(Loaded, String)> {
+        let loaded = load(path, options)?;
+        tce_base::note!("{}", loaded.report);
+        Ok((loaded, sha256_file(&main_file(path))?))
+    }
+
+    /// The rows of a file that are not the target's. `tce augment` writes those beside the generated ones, and a learner that takes half of
+    /// every batch from the target would see them twice.
+    fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
+        let options = LoadOptions { all_columns: true, ..options.clone() };
+        let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
+        let bits = |t: &Transitions, i: usize| -> Vec<u32> {
+            let parts = [t.observation(i), t.action(i), t.next_observation(i)];
+            parts.into_iter().flatten().map(|x| x.to_bits()).collect()
+        };
+        let own = target.complete();
+        let known: HashSet<Vec<u32>> = (0..own.len()).map(|i| bits(own, i)).collect();
+        let origin = columns.get("origin");
+        let is_target =
+            |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&transitions, i).as_slice());
+        let others: Vec<usize> = (0..transitions.len()).filter(|&i| !is_target(i)).collect();
+        if others.len() == transitions.len() {
+            return Ok(Self::new(transitions, path, hash));
+        }
+        if others.is_empty() {
+            return Err(Error::Usage(format!(
+                "{}: found the rows of {} alone, expected others; leave out --extra, or give a file with generated or source rows",
+                path.display(),
+                target.file.display()
+            )));
+        }
+        let left_out = transitions.len() - others.len();
+        tce_base::note!(
+            "{}: {left_out} of its {} rows are target rows and are left out, for --target brings them",
+            path.display(),
+            transitions.len()
+        );
+        Ok(Self::new(transitions.select(&others), path, format!("{hash}, without {left_out} target rows")))
+    }
+
+    fn new(rows: Transitions, file: &Path, hash: String) -> Self {
+        let (rows, complete) = match rows.with_successors() {
+            Cow::Borrowed(_) => (rows, None),
+            Cow::Owned(known) => (known, Some(rows)),
+        };
+        Self { rows, complete, own_actions: None, file: file.to_owned(), hash }
+    }
+
+    /// Refuses rows of which nothing can be learned.
+    fn usable(&self) -> Result<()> {
+        let refuse = |found: String, expected: &str| {
+            let file = self.file.display();
+            Err(Error::Failed(format!("{file}: found {found}, expected {expected}; record more of this robot")))
+        };
+        if self.rows.len() < LEAST_ROWS {
+            return refuse(format!("{} rows with a next state", self.rows.len()), &format!("at least {LEAST_ROWS}"));
+        }
+        let varies = |values: &[f32], dim: usize| Standardizer::fit(values, dim).dead.len() < dim;
+        if !varies(&self.rows.observations, self.rows.obs_dim) {
+            return refuse("states that never change".into(), "at least one column of `observations` that does");
+        }
+        let pairs = self.rows.next_observations.iter().zip(&self.rows.observations);
+        if pairs.clone().all(|(next, state)| next == state) {
+            return refuse("next states that are the states".into(), "a robot that moves");
+        }
+        Ok(())
+    }
+
+    /// Whether rows follow each other: half of them do at least.
+    pub fn has_episodes(&self) -> bool {
+        2 * self.complete().episodes().len() <= self.complete().len()
+    }
+
+    /// All rows, for whoever learns without looking at s' where an episode ended.
+    pub fn complete(&self) -> &Transitions {
+        self.complete.as_ref().unwrap_or(&self.rows)
+    }
+
+    fn scale(&mut self, range: &ActionRange) {
+        range.to_unit(&mut self.rows.actions);
+        self.complete.iter_mut().for_each(|t| range.to_unit(&mut t.actions));
+    }
+
+    fn behaviour(&self, reference: Option<ReferenceScores>, limit: Option<usize>) -> Behaviour {
+        let content = tce_data::inspect(self.complete(), limit);
+        let (returns, score) = (&content.returns, content.normalised_score(reference));
+        Behaviour {
+            file: self.file.clone(),
+            rows: self.rows.len(),
+            episodes: returns.count,
+            mean: returns.mean,
+            std: returns.std,
+            score,
+        }
+    }
+}
+
+/// What identifies the inputs in a specification.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct InputSpec {
+    agent: Option<Agent>,
+    shift: Option<Shift>,
+    target: String,
+    source: Option<String>,
+    /// The rows that are imitated, where they are not all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    chosen: Option<String>,
+    /// The units of actions; they depend on all files.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    actions: Option<ActionRange>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    step_limit: Option<usize>,
+}
+
+/// The first `rows` rows, the last of which ends its episode; None where those are all (0 means all of them, too).
+pub(crate) fn first_rows(t: &Transitions, rows: usize) -> Option<Transitions> {
+    (rows > 0 && rows < t.len()).then(|| {
+        let mut first = t.select(&(0..rows).collect::<Vec<_>>());
+        first.timeouts[rows - 1] = !first.terminals[rows - 1];
+        first
+    })
+}
+
+impl Inputs {
+    /// A user's own files: of a robot of which only that is known that the user says.
+    pub fn of_files(source: Option<&Path>, target: &Path, extra: Option<&Path>, own: &Own) -> Result<Self> {
+        let options = own.load_options();
+        let table = |path: &Path| Table::read(path, &options);
+        let (target, source) = (table(target)?, source.map(table).transpose()?);
+        let extra = extra.map(|path| Table::besides(path, &options, &target)).transpose()?;
+        let (agent, limit) = (own.agent(), own.step_limit.map(|n| n as usize));
+        Self { agent, shift: None, target, source, extra, actions: None, limit }.checked(own)
+    }
+
+    /// Finds the units of the files' actions, and brings all tables into the box.
+    fn bring_into_the_box(&mut self, own: &Own) -> Result<()> {
+        let tables = [Some(&self.target), self.source.as_ref(), self.extra.as_ref()];
+        let rows: Vec<&Transitions> = tables.into_iter().flatten().map(Table::complete).collect();
+        let found = ActionRange::of(&rows);
+        if let Some(found) = found.as_ref().filter(|r| !r.fits(rows[0].act_dim)) {
+            return Err(Error::Failed(format!(
+                "{}: found actions of {found}, expected a range that float32 can hold; scale them",
+                self.target.file.display()
+            )));
+        }
+        let wild = if own.action_range.is_none() { ActionRange::with_outliers(&rows) } else { Vec::new() };
+        if !wild.is_empty() {
+            tce_base::note!(
+                "warning: action columns {wild:?} have values more than ten times what 99.9 % of them are: all others become small inside. Remove \
+                 them, or give --action-range"
+            );
+        }
+        let range = match (&own.action_range, self.agent) {
+            (Some(given), _) => {
+                let range = range_of(given, rows[0].act_dim, &self.target.file).map_err(Error::Usage)?;
+                let outside: usize = rows.iter().map(|t| range.outside(&t.actions)).sum();
+                if outside > 0 {
+                    tce_base::note!("warning: {outside} action values lie outside of --action-range {range}");
+                }
+                Some(range)
+            }
+            // The benchmark's robots take actions in the box, and clamp others.
+            (None, Some(agent)) => {
+                if let Some(found) = &found {
+                    tce_base::note!("warning: actions range over {found}; {agent} clamps them to [-1, 1]");
+                }
+                None
+            }
+            (None, None) => {
+                if let Some(found) = &found {
+                    tce_base::note!(
+                        "actions range over {found}: scaled to [-1, 1] inside; generated rows and policies are in these units \
+                         (--action-range sets others)"
+                    );
+                }
+                found
+            }
+        };
+        self.actions = range.filter(|r| !r.is_unit());
+        if let Some(range) = &self.actions {
+            // The target's alone are written again.
+            self.target.own_actions = Some(self.target.complete().actions.clone());
+            let (target, source, extra) = (&mut self.target, &mut self.source, &mut self.extra);
+            std::iter::once(target).chain(source).chain(extra).for_each(|table| table.scale(range));
+        }
+        Ok(())
+    }
+
+    /// All target rows as the file has them.
+    pub fn target_in_own_units(&self) -> Transitions {
+        let mut rows = self.target.complete().clone();
+        if let Some(own) = &self.target.own_actions {
+            rows.actions.clone_from(own);
+        }
+        rows
+    }
+
+    /// `rows` of the program in the units of the files.
+    pub fn in_own_units(&self, rows: &Transitions) -> Transitions {
+        let mut rows = rows.clone();
+        self.actions.iter().for_each(|range| range.to_own(&mut rows.actions));
+        rows
+    }
+
+    /// The data of a benchmark task: files where given; otherwise OTDF's public target file if the shared folder has it, and
+    /// what the zoo's actors (or those of the shared folder) collect: 5000 target rows, and source rows by D4RL's recipe of
+    /// which `source_rows` is the size of a medium set. Collected rows are kept beside the results. Without `source_rows` no
+    /// source is looked at.
+    pub fn of_task(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<Self> {
+        let Task { agent, shift, .. } = task;
+        let own = Own { env: Some((agent, shift)), ..Own::default() };
+        let options = own.load_options();
+        let target = Table::read(&target_file(task, args)?, &options)?;
+        let source = source_rows.map(|rows| Table::read(&source_file(task, args, rows)?, &options)).transpose()?;
+        let (agent, shift) = (Some(agent), Some(shift));
+        Self { agent, shift, target, source, extra: None, actions: None, limit: None }.checked(&own)
+    }
+
+    /// [`Inputs::of_task`] as `config` wants them: without source rows if it has no use for them, with as many target rows as it says.
+    pub fn of_config(task: Task, args: &DataArgs, config: &Config) -> Result<Self> {
+        let rows = config.needs_source().then_some(config.source.rows);
+        Ok(Self::of_task(task, args, rows)?.with_target_rows(config.target.rows))
+    }
+
+    /// The same with other target rows, of which `hash` tells what they are.
+    pub fn with_target(mut self, rows: Transitions, hash: String) -> Self {
+        // The first rows, in all places where actions in own units are asked for later.
+        let own_actions = self.target.own_actions.take().map(|mut own| {
+            own.truncate(rows.actions.len());
+            own
+        });
+        self.target = Table { own_actions, ..Table::new(rows, &self.target.file, hash) };
+        self
+    }
+
+    /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
+    pub fn with_target_rows(self, rows: usize) -> Self {
+        let Some(first) = first_rows(self.target.complete(), rows) else { return self };
+        let hash = format!("{}, the first {rows} rows", self.target.hash);
+        self.with_target(first, hash)
+    }
+
+    /// The trajectories to imitate, where `config` wants the better ones and the returns show two behaviours; None: all of them.
+    pub fn choice(&self, config: &TargetConfig) -> Option<Choice> {
+        let wanted = config.trajectories == Trajectories::Auto && self.target.has_episodes();
+        wanted.then(|| choose_trajectories(self.target.complete())).filter(Choice::is_selective)
+    }
+
+    /// Refuses target rows in no order for a learner that follows episodes.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn ensure_episodes(&self, learner: &LearnerConfig) -> Result<()> {
+        let needs = match learner.algorithm {
+            Algorithm::MetaDt => "meta-dt learns sequences",
+            _ if learner.top < 1.0 => "learner.top chooses by the returns of episodes",
+            _ => return Ok(()),
+        };
+        match self.target.has_episodes() {
+            true => Ok(()),
+            false => Err(Error::Failed(format!(
+                "{}: found rows in no order ({} episodes in {} rows), expected episodes: {needs}; record them in order, or choose another learner",
+                self.target.file.display(),
+                self.target.complete().episodes().len(),
+                self.target.complete().len()
+            ))),
+        }
+    }
+
+    /// The target rows that learners imitate. What only has to know the dynamics (label models, learned dynamics) takes all rows.
+    pub fn learned_from(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
+        match self.choice(config) {
+            Some(choice) => Cow::Owned(self.target.complete().select(&choice.rows)),
+            None => Cow::Borrowed(self.target.complete()),
+        }
+    }
+
+    /// Those of [`Self::learned_from`] whose successor is known, which the generator imitates.
+    pub fn imitated(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
+        match self.learned_from(config) {
+            Cow::Borrowed(_) => Cow::Borrowed(&self.target.rows),
+            Cow::Owned(rows) => Cow::Owned(rows.with_successors().into_owned()),
+        }
+    }
+
+    /// [`Inputs::spec`] of work that sees the imitated rows alone.
+    pub fn spec_imitated(&self, with_source: bool, config: &TargetConfig) -> InputSpec {
+        let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
+        InputSpec { chosen, ..self.spec(with_source) }
+    }
+
+    /// Refuses files that do not fit, and brings all tables into the box.
+    fn checked(mut self, own: &Own) -> Result<Self> {
+        std::iter::once(&self.target).chain(&self.source).chain(&self.extra).try_for_each(Table::usable)?;
+        for other in self.source.iter().chain(&self.extra) {
+            ensure_same_agent(&other.rows, &self.target.rows, self.agent)?;
+            let (a, b) = (infer_agents(&other.rows), infer_agents(&self.target.rows));
+            if self.agent.is_none() && !a.is_empty() && !b.is_empty() && !a.iter().any(|x| b.contains(x)) {
+                tce_base::note!(
+                    "note: {} looks like {}, {} like {}; if these are robots of the benchmark, they are not the same one",
+                    other.file.display(),
+                    a[0],
+                    self.target.file.display(),
+                    b[0]
+                );
+            }
+        }
+        self.refuse_mixed_up()?;
+        self.bring_into_the_box(own)?;
+        Ok(self)
+    }
+
+    /// Refuses a source that is the target, and warns of one that is smaller: files get mixed up.
+    fn refuse_mixed_up(&self) -> Result<()> {
+        let Some(source) = &self.source else { return Ok(()) };
+        if source.hash == self.target.hash {
+            return Err(Error::Usage(format!(
+                "{} and {}: found the same data as source and as target; give the log of the old robot as source, and that of the \
+                 changed one as target",
+                source.file.display(),
+                self.target.file.display()
+            )));
+        }
+        let (many, few) = (source.complete().len(), self.target.complete().len());
+        if many < few {
+            tce_base::note!(
+                "warning: the source ({}) has {many} rows, fewer than the target ({}) with {few}; are the two mixed up?",
+                source.file.display(),
+                self.target.file.display()
+            );
+        }
+        Ok(())
+    }
+
+    /// What identifies these inputs; with `source` left out for stages that do not look at it.
+    pub fn spec(&self, with_source: bool) -> InputSpec {
+        InputSpec {
+            agent: self.agent,
+            shift: self.shift,
+            target: self.target.hash.clone(),
+            source: self.source.as_ref().filter(|_| with_source).map(|s| s.hash.clone()),
+            chosen: None,
+            actions: self.actions.clone(),
+            step_limit: self.limit,
+        }
+    }
+
+    /// The source.
+    ///
+    /// # Errors
+    /// If the run has none.
+    pub fn source(&self) -> Result<&Table> {
+        let source = self.source.as_ref();
+        source.ok_or_else(|| Error::Usage("this configuration needs source data; give a file with --source".into()))
+    }
+
+    /// The source rows whose successor is known.
+    ///
+    /// # Errors
+    /// If the run has none.
+    pub fn source_rows(&self) -> Result<&Transitions> {
+        Ok(&self.source()?.rows)
+    }
+
+    /// How good the policies were that collected the source and the target rows.
+    pub fn behaviour(&self, table: ScoreTable) -> (Option<Behaviour>, Behaviour) {
+        let of_source = self.agent.and_then(|agent| reference_scores(agent, Shift::Source, table));
+        let limit = self.limit.or(self.agent.map(|_| EPISODE_LIMIT));
+        let source = self.source.as_ref().map(|s| s.behaviour(of_source, limit));
+        (source, self.target.behaviour(self.reference(table), limit))
+    }
+
+    /// The returns that stand for 0 and 100 in the target domain.
+    pub fn reference(&self, table: ScoreTable) -> Option<ReferenceScores> {
+        reference_scores(self.agent?, self.shift?, table)
+    }
+}
+
+/// Where the data of a task come from.
+enum Origin {
+    /// A file that is there.
+    File(PathBuf),
+    /// Actors that collect it.
+    Collected(Recipe),
+}
+
+fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
+    let Task { agent, shift, target, .. } = task;
+    let public = task.target_file(&shared_folder());
+    match &args.target {
+        Some(path) => Ok(Origin::File(path.clone())),
+        None if !args.from_zoo && public.exists() => Ok(Origin::File(public)),
+        None => {
+            let recipe = exhibits::cast(agent, shift)?.target(agent, shift, target, 0);
+            Ok(Origin::Collected(recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?))
+        }
+    }
+}
+
+fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
+    match &args.source {
+        Some(path) => Ok(Origin::File(path.clone())),
+        None => Ok(Origin::Collected(d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?)),
+    }
+}
+
+/// The target data of a task, collected now if it has to be; see [`Inputs::of_task`].
+///
+/// # Errors
+/// If the zoo lacks an actor, or the rows cannot be written.
+pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
+    match target_origin(task, args)? {
+        Origin::File(path) => Ok(path),
+        Origin::Collected(recipe) => collected(&recipe, task.target, args),
+    }
+}
+
+/// The source data of a task, of which `rows` is the size of a medium set, collected now if it has to be.
+///
+/// # Errors
+/// As for [`target_file`].
+pub fn source_file(task: Task, args: &DataArgs, rows: usize) -> Result<PathBuf> {
+    match source_origin(task, args, rows)? {
+        Origin::File(path) => Ok(path),
+        Origin::Collected(recipe) => collected(&recipe, task.source, args),
+    }
+}
+
+/// Whether the data of a task can be had; of the source only where `source_rows` are needed. Nothing is collected.
+///
+/// # Errors
+/// What is missing, and where it was looked for.
+pub fn ensure_data(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<()> {
+    let origins = std::iter::once(target_origin(task, args)).chain(source_rows.map(|n| source_origin(task, args, n)));
+    for origin in origins {
+        if let Origin::File(path) = origin?
+            && !path.exists()
+        {
+            return Err(Error::missing(&path, format!("there is no such file; {task} needs it")));
+        }
+    }
+    Ok(())
+}
+
+fn collected(recipe: &Recipe, quality: Quality, args: &DataArgs) -> Result<PathBuf> {
+    Ok(recipe.cached(&args.out.join("data"), &format!("{}-{}-{quality}", recipe.agent, recipe.shift))?)
+}
+
+/// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo
+/// lacks, unless `from_zoo`.
+///
+/// # Errors
+/// If an actor is missing in both.
+pub fn d4rl_recipe(agent: Agent, quality: Quality, rows: usize, seed: u64, from_zoo: bool) -> Result<Recipe> {
+    let of = |cast: Cast| cast.source(agent, Shift::Source, quality, rows, seed);
+    let recipe = of(exhibits::cast(agent, Shift::Source)?);
+    let recipe = recipe.or_else(|| if from_zoo { None } else { of(stand_ins::cast(agent, &shared_folder())) });
+    recipe.ok_or_else(|| missing(Shift::Source, quality, agent, "--source"))
+}
+
+fn missing(shift: Shift, quality: Quality, agent: Agent, option: &str) -> Error {
+    Error::missing(
+        &shared_folder(),
+        format!(
+            "no {quality} data of {agent}-{shift}: the zoo has no actors for it (tce zoo list), and neither has this folder; \
+             give a file with {option}, or set TCE_SHARED to the folder that holds datasets/otdf and policies"
+        ),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fewer_target_rows_are_as_if_the_log_had_ended() {
+        let mut t = Transitions::new(1, 1);
+        (0..10).for_each(|i| t.push(&[i as f32], &[0.0], i as f32, &[i as f32 + 1.0], i == 4, i == 9));
+        let table = |rows: &Transitions| Table::new(rows.clone(), Path::new("t.hdf5"), "h".into());
+        let inputs = |rows: usize| {
+            let (target, source) = (table(&t), Some(table(&t)));
+            let all = Inputs { agent: None, shift: None, target, source, extra: None, actions: None, limit: None };
+            all.with_target_rows(rows)
+        };
+        let few = inputs(7);
+        assert_eq!(few.target.rows.rewards, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(few.target.rows.episodes().iter().map(|e| e.end).collect::<Vec<_>>(), [5, 7]);
+        assert!(few.target.rows.timeouts[6] && !few.target.rows.terminals[6]);
+        assert_eq!(few.target.hash, "h, the first 7 rows");
+        // An episode that is over is not cut off.
+        let ended = inputs(5).target.rows;
+        assert!(ended.terminals[4] && !ended.timeouts[4]);
+        for rows in [0, 10, 11] {
+            assert_eq!((inputs(rows).target.rows.len(), inputs(rows).target.hash.as_str()), (10, "h"), "{rows}");
+        }
+        assert_eq!(few.source.unwrap().rows.len(), 10, "the source stays");
+    }
+}

@@ -1,0 +1,29 @@
+//! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
+
+pub mod config;
+pub mod course;
+pub mod diagnosis;
+pub mod error;
+pub mod expand;
+pub mod generator;
+pub mod inputs;
+pub mod joint;
+pub mod judge;
+pub mod keys;
+pub mod layers;
+pub mod learning;
+pub mod methods;
+pub mod mixture;
+pub mod own;
+pub mod pipeline;
+pub mod processor;
+pub mod recipe;
+pub mod stage;
+pub mod study;
+pub mod sweep;
+pub mod units;
+pub mod variant;
+pub mod verdict;
+pub mod wrong_keys;
+
+pub use error::{Error, Result};
