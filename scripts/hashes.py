@@ -96,8 +96,10 @@ def choices(text, option):
 
 
 def content_hash(path):
-    """Of a file; of JSON without what is left out."""
+    """Of a file; of JSON without what is left out, and of metrics in one order: two trainings side by side write one file."""
     data = path.read_bytes()
+    if path.suffix == ".jsonl":
+        data = b"".join(sorted(data.splitlines(keepends=True)))
     if path.suffix == ".json":
         data = json.dumps(without(json.loads(data)), sort_keys=True).encode()
     return hashlib.sha256(data).hexdigest()

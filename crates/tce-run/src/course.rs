@@ -6,10 +6,11 @@
 use std::path::Path;
 
 use serde_json::{Value, json};
+use tce_augment::config::Length;
 use tce_base::{Step, plan_course, sha256_hex};
 use tce_nn::Device;
 
-use crate::config::{Algorithm, Config, GeneratedRows, Length, SourceRows};
+use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
 use crate::processor::Processor;
 
 /// The file with costs, in the folder of runs.

@@ -67,6 +67,19 @@ impl Error {
     }
 }
 
+impl From<tce_augment::Error> for Error {
+    fn from(error: tce_augment::Error) -> Self {
+        match error {
+            tce_augment::Error::Data(error) => Self::Data(error),
+            tce_augment::Error::File(error) => Self::File(error),
+            tce_augment::Error::Learn(error) => Self::Learn(error),
+            tce_augment::Error::Diffusion(error) => Self::Diffusion(error),
+            tce_augment::Error::Failed(text) => Self::Failed(text),
+            tce_augment::Error::Interrupted => Self::Interrupted,
+        }
+    }
+}
+
 impl From<tce_zoo::Error> for Error {
     fn from(error: tce_zoo::Error) -> Self {
         match error {

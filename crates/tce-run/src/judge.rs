@@ -17,16 +17,15 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use tce_augment::score_training::hold_out_runs;
 use tce_base::{Streams, mean_std};
-use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, nn_distances};
+use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, nn_distances};
 use tce_learn::{Domain, Dynamics, DynamicsConfig, Learner, Policy, rmse, train_dynamics};
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::{Error, Result};
-use crate::generator::hold_out_runs;
 use crate::inputs::{InputSpec, Inputs};
 use crate::stage::Stage;
-use crate::units::even_standardizer;
 
 /// States from which a policy is tried, for each network of the ensemble.
 const STARTS: usize = 32;

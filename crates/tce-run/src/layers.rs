@@ -298,6 +298,17 @@ mod tests {
         Layered::new(preset, task.map(|t| t.parse().unwrap()), None, None, &sets)
     }
 
+    /// The library's recommended settings are the preset's, written twice.
+    #[test]
+    fn the_library_recommends_the_default_preset() {
+        use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
+        let config = layered(Preset::Default, None, &[]).unwrap().config().unwrap();
+        assert_eq!(config.generator, GeneratorConfig::recommended());
+        assert_eq!(config.filter, FilterConfig::recommended());
+        assert_eq!(config.labels, LabelsConfig::recommended());
+        assert_eq!(config.joint, SingleStageConfig::recommended());
+    }
+
     #[test]
     fn mixtures_are_cloned_for_fewer_steps() {
         let mut learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;

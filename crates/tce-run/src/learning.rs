@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::metrics::{Line, Metrics};
 use tce_base::{Streams, interrupted};
-use tce_data::{Standardizer, Transitions};
+use tce_data::{Standardizer, Transitions, even_standardizer};
 use tce_learn::{
     Buffer, Journal, Lane, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, best_trajectories,
     return_range_scale, train_side_by_side,
@@ -22,7 +22,6 @@ use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::methods::build;
 use crate::processor::Processor;
-use crate::units::even_standardizer;
 
 /// The data of one member: target rows, and perhaps others.
 #[derive(Clone, Debug)]

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use serde::Serialize;
+use tce_augment::single_stage::{enough_to_score, score_streams};
 use tce_data::{Rows, Transitions, TransportOptions, density_scores, transport_costs};
 use tce_learn::{
     Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, MetaDt, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo,
@@ -12,7 +13,6 @@ use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
-use crate::joint::{enough_to_score, score_streams};
 
 /// [`Method::needs`] of learners that compare the domains.
 pub const SOURCE_ROWS: &str = "source rows";

@@ -5,22 +5,23 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
+use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig};
+use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
 use tce_learn::{DynamicsConfig, Mode};
 use tce_nn::Device;
 use tce_zoo::actors::{Arena, Evaluation};
 
 use crate::config::{
-    Algorithm, Config, EvaluationConfig, FilterConfig, GeneratedRows, GeneratorConfig, LabelsConfig, MixtureConfig,
-    SourceRows,
+    Algorithm, Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage,
 };
 use crate::error::{Error, Result};
+use crate::expand::single_stage;
 use crate::expand::{Generated, expand, label_models};
 use crate::inputs::{InputSpec, Inputs};
-use crate::joint;
 use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::methods::{closeness, row_scores};
-use crate::mixture::{Extra, distances, extra_rows};
+use crate::mixture::{distances, extra_rows};
 use crate::stage::Stage;
 
 /// The outcome of a variant.
@@ -111,7 +112,7 @@ impl Config {
     /// The number of every source row by which the learner chooses, where it is computed once for all seeds.
     fn source_scores(&self, inputs: &Inputs, root: &Path) -> Result<Option<Arc<Vec<f32>>>> {
         match self.learner.algorithm {
-            Algorithm::Dmc => Ok(Some(Arc::new(joint::scores(inputs, &self.joint.scores, root)?.source))),
+            Algorithm::Dmc => Ok(Some(Arc::new(single_stage::scores(inputs, &self.joint.scores, root)?.source))),
             Algorithm::Otdf if self.source_alone() => {
                 Ok(Some(closeness(distances(inputs, SourceRows::Transport, root)?)))
             }
@@ -144,7 +145,7 @@ pub fn run(
         filter: two_stages.then_some(&config.filter),
         labels: (two_stages || relabelled).then_some(&config.labels),
         dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
-        joint: config.joint.used(config.mixture.generated, config.learner.algorithm),
+        joint: used_of_single_stage(&config.joint, config.mixture.generated, config.learner.algorithm),
     };
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
     if let Some(summary) = stage.summary::<Summary>()? {
@@ -167,7 +168,7 @@ pub fn run(
         }
         reports = expansion.reports;
         let scored = expansion.tables.into_iter().zip(expansion.scores);
-        tables = Some(scored.map(|(rows, scores)| Extra { rows, scores }).collect::<Vec<_>>());
+        tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
     }
     let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
     let scores = config.source_scores(inputs, root)?;
@@ -188,7 +189,7 @@ pub fn run(
         // Generated rows among them are no trajectories.
         trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
     }
-    let scores = |rows: &Extra| match &rows.scores {
+    let scores = |rows: &ScoredRows| match &rows.scores {
         Some(scores) => Ok(Some(scores.clone())),
         // Generated rows among them are each seed's own.
         None => row_scores(config, &target, &rows.rows),

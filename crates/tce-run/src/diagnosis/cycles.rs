@@ -9,6 +9,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Serialize;
+use tce_augment::score_training::held_out_rows;
+use tce_augment::two_stage::{Draw, Generator};
 use tce_base::metrics::recorded;
 use tce_base::{Streams, sha256_file};
 use tce_data::{Agent, Shift, Transitions};
@@ -24,8 +26,9 @@ use super::measures::pairs;
 use crate::config::Config;
 use crate::error::Result;
 use crate::expand::label_models;
-use crate::generator::{Generator, cycle_file, held_out_rows};
+use crate::expand::networks;
 use crate::inputs::Inputs;
+use crate::kept::cycle_file;
 use crate::stage::Stage;
 
 /// What was measured of one network.
@@ -84,7 +87,7 @@ impl Bench<'_> {
     fn measure(&self, generator: &Generator) -> Result<AtCycle> {
         let (units, sampler) = (&generator.units, self.config.generator.sampler);
         let members = [self.streams];
-        let successors = generator.sample_successors(&self.states, &sampler, &members, self.target, None)?;
+        let successors = generator.sample_successors(&self.states, &Draw::new(&sampler, &members, self.target))?;
         let pair = (units.put_back(&self.states), units.put_back(&successors));
         let rows = self.models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
         let judged = self.held_out.as_ref().map(|h| h.judge(&pairs(units, &rows), &self.streams)).transpose()?;
@@ -127,7 +130,7 @@ pub fn cycles(
     device: &Device,
     mut said: impl FnMut(&AtCycle),
 ) -> Result<Cycles> {
-    let (mut generator, stage, trained) = Generator::train(inputs, config, &[seed], root, device)?;
+    let (mut generator, stage, trained) = networks(inputs, config, &[seed], root, device)?;
     let (models, ..) = label_models(inputs, &config.labels, &[seed], root, device)?;
     let target = &inputs.target.rows;
     let streams = Streams::new(seed).child("diagnosis/cycles");
@@ -139,7 +142,7 @@ pub fn cycles(
         models: &models,
         config,
         place,
-        states: generator.sample_states(rows, 0.0, &config.generator.sampler, &[streams], target, None)?,
+        states: generator.sample_states(rows, 0.0, &Draw::new(&config.generator.sampler, &[streams], target))?,
         split: held_out_rows(target.len(), &config.generator),
         held_out: HeldOut::new(pairs(&units, target), 2 * units.live.len(), episodes_of)?,
         episodes,
@@ -168,8 +171,8 @@ pub fn cycles(
     if !networks.iter().any(|n| n.chosen) {
         generator.transition = chosen;
         let updates = match config.generator.transition_steps {
-            crate::config::Length::Steps(steps) => Some(steps),
-            crate::config::Length::Auto => None,
+            tce_augment::config::Length::Steps(steps) => Some(steps),
+            tce_augment::config::Length::Auto => None,
         };
         let found = AtCycle { updates, chosen: true, ..bench.measure(&generator)? };
         said(&found);

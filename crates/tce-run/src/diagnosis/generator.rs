@@ -10,6 +10,9 @@
 //! inverse dynamics model is to blame for.
 
 use serde::Serialize;
+use tce_augment::config::GeneratorConfig;
+use tce_augment::finish::Finisher;
+use tce_augment::two_stage::{Draw, Generator};
 use tce_base::Streams;
 use tce_data::{Agent, Rows, Shift, Standardizer, Transitions};
 use tce_diffusion::Sampler;
@@ -17,10 +20,7 @@ use tce_diffusion::metrics::{sliced_wasserstein, std_ratios};
 use tce_learn::{LabelModels, TerminalHandling};
 use tce_sim::simulate;
 
-use crate::config::GeneratorConfig;
 use crate::error::Result;
-use crate::expand::Finisher;
-use crate::generator::Generator;
 
 /// Random directions of a sliced Wasserstein distance.
 const PROJECTIONS: usize = 256;
@@ -116,9 +116,10 @@ pub fn quality(
     let units = &generator.units;
     let d = units.live.len();
     let started = std::time::Instant::now();
-    let states = generator.sample_states(rows, 0.0, sampler, &members, training, None)?;
+    let draw = Draw::new(sampler, &members, training);
+    let states = generator.sample_states(rows, 0.0, &draw)?;
     let seconds = started.elapsed().as_secs_f64();
-    let successors = generator.sample_successors(&states, sampler, &members, training, None)?;
+    let successors = generator.sample_successors(&states, &draw)?;
     let scale = Standardizer::fit(&units.take(&training.observations), d);
     let generated = scale.apply(&states);
     let real = |t: &Transitions| scale.apply(&units.take(&t.observations));
@@ -130,8 +131,8 @@ pub fn quality(
     let step = step_std(training, &units.live);
     let pair = (units.put_back(&states), units.put_back(&successors));
     let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-    let expanded_states = generator.sample_states(rows, config.y_max, sampler, &members, training, None)?;
-    let expanded_successors = generator.sample_successors(&expanded_states, sampler, &members, training, None)?;
+    let expanded_states = generator.sample_states(rows, config.y_max, &draw)?;
+    let expanded_successors = generator.sample_successors(&expanded_states, &draw)?;
     let expanded = finisher.finish(&[(&expanded_states, &expanded_successors)])?.remove(0).transitions;
     Ok(Quality {
         evaluations: sampler.evaluations(),

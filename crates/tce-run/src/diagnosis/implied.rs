@@ -5,6 +5,7 @@
 //! at the same rows stands beside the figures.
 
 use rand::RngExt;
+use tce_augment::two_stage::{Draw, Generator};
 use tce_base::random::fill_normal;
 use tce_base::{Rng, Streams, interrupted, mean_std};
 use tce_data::Transitions;
@@ -16,7 +17,6 @@ use tce_sim::{Actor, SimError};
 use tce_zoo::actors::Arena;
 
 use crate::error::{Error, Result};
-use crate::generator::Generator;
 
 /// Target rows of each group, at most.
 const ROWS: usize = 2000;
@@ -50,7 +50,7 @@ impl<'a> ImpliedActor<'a> {
         device: &Device,
     ) -> Self {
         let generator = generator.member(member);
-        let start = generator.transition.process().starts_at_data().then(|| generator.outputs(target));
+        let start = generator.transition.process().starts_at_data().then(|| generator.units.outputs(target));
         Self { generator, models, member, sampler, start, device: device.clone() }
     }
 
@@ -127,7 +127,7 @@ pub fn implied_actions(
         let units = &actor.generator.units;
         let states = units.take(&t.observations).repeat(draws);
         let members = [streams.child(name)];
-        let successors = actor.generator.sample_successors(&states, &actor.sampler, &members, target, None)?;
+        let successors = actor.generator.sample_successors(&states, &Draw::new(&actor.sampler, &members, target))?;
         let repeated = t.observations.repeat(draws);
         let drawn = actor.models.actions(actor.member, &repeated, &units.put_back(&successors))?;
         let inferred = actor.models.actions(actor.member, &t.observations, &t.next_observations)?;
@@ -181,7 +181,7 @@ mod tests {
     use tce_nn::{Checkpoints, cpu};
 
     use super::*;
-    use crate::units::Units;
+    use tce_augment::units::Units;
 
     /// Labels and a generator of a population of one, trained for some updates on `t`.
     fn trained(t: &Transitions, steps: u64) -> (Generator, LabelModels) {

@@ -3,6 +3,8 @@
 use std::path::Path;
 
 use rand::seq::SliceRandom;
+use tce_augment::score_training::held_out_rows;
+use tce_augment::units::Units;
 use tce_base::random::choose;
 use tce_base::{Streams, begin_step};
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
@@ -21,9 +23,7 @@ use super::rows::{Batch, Sampler};
 use super::{Options, Subject, generator};
 use crate::config::SourceRows;
 use crate::error::Result;
-use crate::generator::held_out_rows;
 use crate::mixture::distances;
-use crate::units::Units;
 
 /// Reference states of each domain behind a coverage.
 const REFERENCE: usize = 2000;

@@ -26,8 +26,7 @@ use tce_nn::Device;
 use crate::config::{Config, GeneratedRows};
 use crate::course::Course;
 use crate::error::{Error, Result};
-use crate::expand::{Finisher, label_models};
-use crate::generator::Generator;
+use crate::expand::{finisher, label_models, networks};
 use crate::inputs::Inputs;
 use crate::stage::Stage;
 
@@ -177,9 +176,9 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         course.step(part, json!([options, inputs.target.rows.len()]));
     }
     course.plan();
-    let (generator, ..) = Generator::train(inputs, config, seeds, root, device)?;
+    let (generator, ..) = networks(inputs, config, seeds, root, device)?;
     let (models, _, errors) = label_models(inputs, &config.labels, seeds, root, device)?;
-    let finisher = Finisher::new(&generator.units, &models, config, inputs);
+    let finisher = finisher(&generator.units, &models, config, inputs);
     let place = (inputs.agent, inputs.shift);
     let simulator = match place {
         (Some(agent), Some(shift)) if options.simulator => Some((agent, shift)),

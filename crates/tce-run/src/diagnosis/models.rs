@@ -16,7 +16,7 @@
 use std::sync::Arc;
 
 use tce_base::Streams;
-use tce_data::{Agent, Standardizer, Transitions};
+use tce_data::{Agent, Standardizer, Transitions, even_standardizer};
 use tce_diagnosis::Rated;
 use tce_diagnosis::gaussian::Normals;
 use tce_learn::{
@@ -30,7 +30,6 @@ use super::measures::{Sources, Work, few};
 use super::rows::Batch;
 use crate::error::{Error, Result};
 use crate::stage::Attempt;
-use crate::units::even_standardizer;
 
 /// The source's model gets as many rows at least, where there are as many, however few abundant rows are asked for.
 const FEWEST_SOURCES: usize = 1000;

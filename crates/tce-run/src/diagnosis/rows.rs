@@ -1,15 +1,15 @@
 //! Generated rows under a label bound, with all that is known of each: whether the filter keeps it, its labels, and what the
 //! simulator makes of it.
 
+use tce_augment::config::{FilterConfig, GeneratorConfig};
+use tce_augment::finish::{Finisher, everything_rejected};
+use tce_augment::two_stage::{Draw, Generator};
 use tce_base::Streams;
 use tce_data::{Agent, Shift, Transitions};
 use tce_diffusion::uniform_labels;
 use tce_sim::{Simulated, simulate};
 
-use crate::config::{FilterConfig, GeneratorConfig};
 use crate::error::{Error, Result};
-use crate::expand::{Finisher, everything_rejected};
-use crate::generator::Generator;
 
 /// Where rows come from.
 pub struct Sampler<'a> {
@@ -65,7 +65,7 @@ impl Batch {
                  another seed or a smaller generator.learning_rate",
                 self.lost
             ))),
-            (_, 0) => Err(everything_rejected(self.len() + self.lost, filter)),
+            (_, 0) => Err(everything_rejected(self.len() + self.lost, filter).into()),
             _ => Ok(()),
         }
     }
@@ -86,8 +86,9 @@ impl Sampler<'_> {
             self.seeds.iter().map(|&s| Streams::new(s).child(&format!("diagnosis/{purpose}"))).collect();
         let Self { generator, config, target, .. } = self;
         let (units, sampler) = (&generator.units, &config.sampler);
-        let all = generator.sample_states(rows, y_max, sampler, &members, target, None)?;
-        let successors = generator.sample_successors(&all, sampler, &members, target, None)?;
+        let draw = Draw::new(sampler, &members, target);
+        let all = generator.sample_states(rows, y_max, &draw)?;
+        let successors = generator.sample_successors(&all, &draw)?;
         let (d, labels) = (units.live.len(), uniform_labels(&members[self.member], "state", rows, y_max));
         let own = self.member * rows * d..(self.member + 1) * rows * d;
         // A row that is no numbers can neither be labelled nor simulated.
@@ -130,7 +131,7 @@ mod tests {
             lost,
         };
         let filter =
-            FilterConfig { enabled: true, by: crate::config::FilterKind::Zscore, z_threshold: 3.0, margin: 2.0 };
+            FilterConfig { enabled: true, by: tce_augment::config::FilterKind::Zscore, z_threshold: 3.0, margin: 2.0 };
         let told = |b: Batch| b.ensure_kept(&filter).map_err(|e| e.to_string());
         assert!(told(batch(vec![], 5)).unwrap_err().contains("none of 5 generated rows is made of finite numbers"));
         assert!(told(batch(vec![false; 3], 1)).unwrap_err().contains("the filter rejected all 4 generated rows"));

@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{FileError, PROGRAM, read_if_there, sha256_file, sha256_hex, write_atomically};
 use tce_data::{Task, main_file};
 
-use crate::config::{Config, GeneratedRows, SourceRows};
+use crate::config::{Config, GeneratedRows, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, ensure_data};
 use crate::layers::{Layered, Preset};
@@ -352,7 +352,7 @@ impl Manifest {
         if generated != GeneratedRows::None || config.mixture.source == SourceRows::Relabelled {
             let own = match generated {
                 GeneratedRows::Synther | GeneratedRows::Dmc => {
-                    serde_json::json!(config.joint.used(generated, config.learner.algorithm))
+                    serde_json::json!(used_of_single_stage(&config.joint, generated, config.learner.algorithm))
                 }
                 GeneratedRows::Tce | GeneratedRows::None => {
                     let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };

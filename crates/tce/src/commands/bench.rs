@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_augment::config::Length;
 use tce_base::{set_quiet, write_json};
 use tce_nn::Device;
-use tce_run::config::Length;
 use tce_run::error::{Error, Result};
 use tce_run::layers::{Layered, Preset};
 use tce_run::processor::Processor;

@@ -11,8 +11,7 @@ use tce_nn::Device;
 use tce_run::diagnosis::cycles::{AtCycle, Cycles, cycles};
 use tce_run::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
 use tce_run::error::Result;
-use tce_run::expand::{Finisher, label_models};
-use tce_run::generator::Generator;
+use tce_run::expand::{finisher, label_models, networks};
 use tce_run::inputs::{DataArgs, Inputs};
 use tce_run::layers::ConfigArgs;
 use tce_run::variant::Variant;
@@ -149,10 +148,10 @@ impl GeneratorArgs {
         let mut rows = Vec::new();
         let mut floors = None;
         for process in processes {
-            let generator_config = tce_run::config::GeneratorConfig { process, ..config.generator.clone() };
+            let generator_config = tce_augment::config::GeneratorConfig { process, ..config.generator.clone() };
             let varied = tce_run::config::Config { generator: generator_config.clone(), ..config.clone() };
-            let (generator, ..) = Generator::train(&inputs, &varied, &seeds, &self.data.out, device)?;
-            let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
+            let (generator, ..) = networks(&inputs, &varied, &seeds, &self.data.out, device)?;
+            let finisher = finisher(&generator.units, &models, &config, &inputs);
             if floors.is_none() {
                 let units = &generator.units;
                 let d = units.live.len();

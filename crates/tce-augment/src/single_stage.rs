@@ -17,35 +17,22 @@
 //! Dimensions that are constant in the training rows (Ant's contact slots, the flag of a robot that never falls) are left out
 //! and put back. Rows with a number that is not finite are dropped; there is no other filter.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::{Arc, Mutex};
-
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_data::{
-    DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, Standardizer, Transitions, density_scores,
-    further_scores, load, save_d4rl,
-};
+use tce_data::{DensityOptions, DensityScale, Rows, Standardizer, Transitions, further_scores};
 use tce_diffusion::{
-    Chunks, Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
+    Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
     uniform_labels,
 };
-use tce_nn::{Device, NamedParameters, cpu};
 
-use crate::config::{Config, GeneratedRows, GuidanceConfig, JointConfig};
+use crate::config::SingleStageConfig;
 use crate::error::{Error, Result};
-use crate::expand::{Expansion, Generated};
-use crate::generator::{Course, Ready, progress, run, start_rows};
-use crate::inputs::{InputSpec, Inputs};
-use crate::stage::Stage;
-
-/// The column of scores in the files of generated rows.
-const SCORE: &str = "score";
+use crate::score_training::{Course, Ready, progress, run, start_rows};
+use crate::work::Work;
 
 /// Between transitions and the rows of the network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct RowUnits {
+pub struct RowUnits {
     obs_dim: usize,
     act_dim: usize,
     /// s', or s' − s, in the row.
@@ -58,7 +45,7 @@ struct RowUnits {
 
 impl RowUnits {
     /// The units in which the rows of `t` have mean 0 and variance 1.
-    fn fit(t: &Transitions, target: Target) -> Self {
+    pub fn fit(t: &Transitions, target: Target) -> Self {
         let width = t.obs_dim + t.act_dim + 1;
         let mut head = Vec::with_capacity(t.len() * width);
         for i in 0..t.len() {
@@ -78,7 +65,7 @@ impl RowUnits {
     }
 
     /// Live, standardised dimensions of every row, `[len, live]`.
-    fn encode(&self, t: &Transitions) -> Vec<f32> {
+    pub fn encode(&self, t: &Transitions) -> Vec<f32> {
         let tail = tail(t, self.target);
         let d = t.obs_dim;
         let mut row = Vec::with_capacity(self.all.dim());
@@ -98,7 +85,7 @@ impl RowUnits {
 
     /// Transitions from rows `[n, live]`, every one an episode of its own; rows with a number that is not finite are left out.
     /// Also which rows those are that stay, and the share of action components outside of the box, before clipping.
-    fn decode(&self, live: &[f32]) -> (Transitions, Vec<usize>, f64) {
+    pub fn decode(&self, live: &[f32]) -> (Transitions, Vec<usize>, f64) {
         let (d, a) = (self.obs_dim, self.act_dim);
         let mut t = Transitions::with_capacity(d, a, live.len() / self.live.len());
         let (mut kept, mut outside) = (Vec::new(), 0usize);
@@ -138,19 +125,19 @@ fn flags(t: &Transitions) -> Vec<f32> {
 
 /// Between scores and conditions, which have mean 0 and variance 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-struct ScoreUnits {
+pub struct ScoreUnits {
     mean: f32,
     std: f32,
 }
 
 impl ScoreUnits {
-    fn fit(scores: &[f32]) -> Self {
+    pub fn fit(scores: &[f32]) -> Self {
         let units = Standardizer::fit(scores, 1);
         Self { mean: units.mean[0], std: units.std[0] }
     }
 
     /// The network's conditions of scores: standardised, and marked as present.
-    fn conditions(&self, scores: &[f32]) -> Vec<f32> {
+    pub fn conditions(&self, scores: &[f32]) -> Vec<f32> {
         let standard: Vec<f32> = scores.iter().map(|s| (s - self.mean) / self.std).collect();
         present(&standard, 1)
     }
@@ -175,24 +162,155 @@ fn draw_scores(scores: &[f32], uniform: &[f32]) -> Vec<f32> {
     uniform.iter().map(|u| scores[(u * scores.len() as f32) as usize]).collect()
 }
 
-/// What training the network leaves behind.
+/// What training the network leaves behind besides it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Trained {
-    units: RowUnits,
-    scores: Option<ScoreUnits>,
+pub struct Trained {
+    /// The maps between rows and transitions.
+    pub units: RowUnits,
+    /// The map of scores, where the network has any.
+    pub scores: Option<ScoreUnits>,
     /// Last reported loss, per member.
-    loss: Vec<f32>,
+    pub loss: Vec<f32>,
     /// Seconds of training, all members together.
-    seconds: f64,
+    pub seconds: f64,
+}
+
+/// The trained network over whole transitions, of a whole population.
+pub struct SingleStage {
+    /// The network.
+    pub model: ScoreModel,
+    /// What it was trained on.
+    pub trained: Trained,
+}
+
+/// Generated rows of one member.
+pub struct Sampled {
+    /// Transitions, every one an episode of its own.
+    pub rows: Transitions,
+    /// The score that each of them was drawn under, where the network has scores.
+    pub scores: Option<Vec<f32>>,
+    /// Share of action components outside of the box, before clipping.
+    pub outside_box: f64,
+}
+
+impl SingleStage {
+    /// Trains the network on `rows`; under their `scores`, if they have any (DmC), and under nothing otherwise (SynthER).
+    ///
+    /// # Errors
+    /// If the settings cannot be used, the network diverges, or the user interrupts.
+    pub fn fit(rows: &Transitions, scores: Option<&[f32]>, config: &SingleStageConfig, work: &Work) -> Result<Self> {
+        let units = RowUnits::fit(rows, config.target);
+        let rows = units.encode(rows);
+        let (d, c) = (units.live.len(), 2);
+        let on = scores.map(|scores| {
+            let units = ScoreUnits::fit(scores);
+            (units, units.conditions(scores))
+        });
+        let data = match &on {
+            // No condition at all is the one that DmC's network learns beside the others.
+            None => {
+                ScoreData::new(vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?
+            }
+            Some((_, on)) => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, false)?
+                .with_dropout(config.guidance.dropout)?,
+        };
+        let SingleStageConfig { width, embedding, blocks, process, steps, .. } = *config;
+        let network = NetworkConfig { width, embedding, blocks, ..NetworkConfig::new(d, c) };
+        let training = training_of(config);
+        let mut trainer = Trainer::new("joint", network, process, training, &work.streams(), work.device)?;
+        let mut checkpoints = work.keeper.checkpoints("joint")?;
+        work.keeper.begin(&[("joint", checkpoints.step().unwrap_or(0))])?;
+        let course = Course::Steps(steps);
+        let Ready { model, loss, .. } = run(&mut trainer, &data, &course, &mut checkpoints, work.keeper, "joint")?;
+        let scores = on.map(|(units, _)| units);
+        Ok(Self { model, trained: Trained { units, scores, loss, seconds: 0.0 } })
+    }
+
+    /// `config.rows` rows for each member. A network with scores draws them under the best percentiles of `scores`, those of its training
+    /// rows. `start` are rows where a process that starts at data starts.
+    ///
+    /// # Errors
+    /// If no row of a member is finite, or the user interrupts.
+    pub fn sample(
+        &self,
+        scores: Option<&[f32]>,
+        start: &Transitions,
+        config: &SingleStageConfig,
+        work: &Work,
+    ) -> Result<Vec<Sampled>> {
+        let (units, members, n) = (&self.trained.units, work.streams(), config.rows);
+        // Per member, under which scores its rows are drawn.
+        let under = scores.map(|scores| -> Vec<Vec<f32>> {
+            let best = best_percentiles(scores, config.guidance.from);
+            members.iter().map(|m| draw_scores(&best, &uniform_labels(m, "joint", n, 1.0))).collect()
+        });
+        let condition = match (&under, &self.trained.scores) {
+            (Some(scores), Some(units)) => units.conditions(&scores.concat()),
+            _ => vec![0.0; 2 * n],
+        };
+        let first = start_rows(self.model.process(), || units.encode(start), units.live.len(), n, &members, "joint");
+        let request = Request {
+            start: first.as_deref(),
+            kept: work.keeper.chunks(),
+            ..request(&condition, config, under.is_some())
+        };
+        let bar = progress("sample transitions", n * members.len(), &config.sampler);
+        let sampled = self.model.sample(request, &config.sampler, &members, Some(&bar))?;
+        bar.finish();
+        let member = |(m, rows): (usize, &[f32])| {
+            let (rows, kept, outside_box) = units.decode(rows);
+            if rows.is_empty() {
+                return Err(Error::Failed(format!(
+                    "seed {}: none of {n} generated rows is finite; lower joint.learning_rate, or look for huge values in the data",
+                    work.seeds[m]
+                )));
+            }
+            let scores = under.as_ref().map(|under| kept.iter().map(|&i| under[m][i]).collect());
+            Ok(Sampled { rows, scores, outside_box })
+        };
+        sampled.chunks(n * units.live.len()).enumerate().map(member).collect()
+    }
+}
+
+/// What is asked of the network, without where it starts and what is kept.
+fn request<'a>(condition: &'a [f32], config: &SingleStageConfig, guided: bool) -> Request<'a> {
+    let guidance = guided.then_some(config.guidance.weight).filter(|w| *w != 1.0);
+    Request { name: "joint", rows: config.rows, condition, guidance, start: None, kept: None }
+}
+
+/// Network evaluations for one row; guidance doubles them.
+pub fn evaluations(config: &SingleStageConfig, guided: bool) -> usize {
+    request(&[], config, guided).evaluations(&config.sampler)
+}
+
+/// How the network is trained.
+pub fn training_of(config: &SingleStageConfig) -> TrainConfig {
+    let SingleStageConfig { learning_rate, schedule, batch, ema, .. } = *config;
+    TrainConfig { learning_rate, schedule, batch, ema }
+}
+
+/// The scores of generated `rows`, measured like those of the source rows, on their `scale`.
+///
+/// # Errors
+/// If there are too few rows.
+pub fn rescored(
+    rows: &Transitions,
+    source: &Transitions,
+    target: &Transitions,
+    scale: &DensityScale,
+    options: &DensityOptions,
+) -> Result<Vec<f32>> {
+    let [rows, source, target] = [rows, source, target].map(Rows::transitions);
+    Ok(further_scores(&rows, &source, &target, scale, options, &score_streams())?)
 }
 
 /// Everything random about scores, which belong to a pair of data sets and to no seed.
-pub(crate) fn score_streams() -> Streams {
+pub fn score_streams() -> Streams {
     Streams::new(0)
 }
 
 /// Refuses tables with fewer rows than the neighbours that a score looks at.
-pub(crate) fn enough_to_score(others: usize, target: usize, options: &DensityOptions) -> Result<()> {
+pub fn enough_to_score(others: usize, target: usize, options: &DensityOptions) -> Result<()> {
     for (what, rows) in [("other", others), ("target", target)] {
         if rows < options.neighbour {
             return Err(Error::Failed(format!(
@@ -202,210 +320,6 @@ pub(crate) fn enough_to_score(others: usize, target: usize, options: &DensityOpt
         }
     }
     Ok(())
-}
-
-/// DmC's scores of the source rows; computed once per pair of data sets.
-pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<DensityScores> {
-    #[derive(Serialize)]
-    struct Spec<'a> {
-        inputs: InputSpec,
-        options: &'a DensityOptions,
-    }
-    let file = "scores.safetensors";
-    let stage = Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
-    if let Some(scale) = stage.summary::<DensityScale>()? {
-        let path = stage.file(file);
-        let mut loaded = NamedParameters::load(&path)?;
-        let mut take = |name: &str| {
-            let tensor = loaded.tensors.remove(name).map(|(_, values)| values);
-            tensor.ok_or_else(|| {
-                Error::missing(&path, format!("no tensor `{name}`; remove the directory to compute it again"))
-            })
-        };
-        return Ok(DensityScores { source: take("source")?, scale });
-    }
-    let (source, target) = (inputs.source_rows()?, &inputs.target.rows);
-    enough_to_score(source.len(), target.len(), options)?;
-    let scores = density_scores(&Rows::transitions(source), &Rows::transitions(target), options, &score_streams())?;
-    let mut out = NamedParameters::default();
-    out.tensors.insert("source".into(), (vec![scores.source.len()], scores.source.clone()));
-    let attempt = stage.attempt()?;
-    out.save(&attempt.file(file))?;
-    attempt.finish(&[file.to_owned()], scores.scale)?;
-    Ok(scores)
-}
-
-/// The trained network, from its stage if it is there.
-fn train(
-    inputs: &Inputs,
-    kind: GeneratedRows,
-    j: &JointConfig,
-    scored: Option<&DensityScores>,
-    seeds: &[u64],
-    root: &Path,
-    device: &Device,
-) -> Result<(ScoreModel, Trained, Stage)> {
-    #[derive(Serialize)]
-    struct Spec<'a> {
-        inputs: InputSpec,
-        seeds: &'a [u64],
-        kind: GeneratedRows,
-        rows: &'static str,
-        process: tce_diffusion::Process,
-        target: Target,
-        sizes: [usize; 3],
-        steps: u64,
-        training: TrainConfig,
-        dropout: Option<f64>,
-        scores: Option<&'a DensityOptions>,
-    }
-    let training = TrainConfig { learning_rate: j.learning_rate, schedule: j.schedule, batch: j.batch, ema: j.ema };
-    let spec = Spec {
-        inputs: inputs.spec(scored.is_some()),
-        seeds,
-        kind,
-        rows: if scored.is_some() { "source" } else { "target" },
-        process: j.process,
-        target: j.target,
-        sizes: [j.width, j.embedding, j.blocks],
-        steps: j.steps,
-        training,
-        dropout: scored.map(|_| j.guidance.dropout),
-        scores: scored.map(|_| &j.scores),
-    };
-    let file = "joint.safetensors";
-    let stage = Stage::open(root, "stages/joint", &spec, device)?;
-    if let Some(trained) = stage.summary::<Trained>()? {
-        return Ok((ScoreModel::load(&stage.file(file), device)?, trained, stage));
-    }
-    let started = std::time::Instant::now();
-    let attempt = stage.attempt()?;
-    let table = if scored.is_some() { inputs.source_rows()? } else { &inputs.target.rows };
-    let units = RowUnits::fit(table, j.target);
-    let rows = units.encode(table);
-    let (d, c) = (units.live.len(), 2);
-    let on = scored.map(|s| {
-        let units = ScoreUnits::fit(&s.source);
-        (units, units.conditions(&s.source))
-    });
-    let data = match &on {
-        // No condition at all is the one that DmC's network learns beside the others.
-        None => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?,
-        Some((_, on)) => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, false)?
-            .with_dropout(j.guidance.dropout)?,
-    };
-    let network =
-        NetworkConfig { width: j.width, embedding: j.embedding, blocks: j.blocks, ..NetworkConfig::new(d, c) };
-    let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
-    let mut trainer = Trainer::new("joint", network, j.process, training, &members, device)?;
-    let mut checkpoints = attempt.checkpoints("joint")?;
-    let from = checkpoints.step().unwrap_or(0);
-    let metrics = Mutex::new(attempt.metrics(|_, at| at <= from)?);
-    let ready = run(&mut trainer, &data, &Course::Steps(j.steps), &mut checkpoints, &metrics, "joint", &attempt)?;
-    let Ready { model, loss, .. } = ready;
-    model.save(&attempt.file(file))?;
-    let scores = on.map(|(units, _)| units);
-    let trained = Trained { units, scores, loss, seconds: started.elapsed().as_secs_f64() };
-    attempt.finish(&[file.to_owned()], &trained)?;
-    Ok((model, trained, stage))
-}
-
-/// Generated tables of SynthER (`kind` synther) or DmC, one per seed, from their stage if they are there.
-pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
-    #[derive(Serialize)]
-    struct Spec {
-        network: String,
-        sampler: tce_diffusion::Sampler,
-        rows: usize,
-        guidance: Option<GuidanceConfig>,
-    }
-    let (j, kind) = (&config.joint, config.mixture.generated);
-    let scored = match kind {
-        GeneratedRows::Dmc => Some(scores(inputs, &j.scores, root)?),
-        _ => None,
-    };
-    tce_base::begin_step("joint network");
-    let (model, trained, network) = train(inputs, kind, j, scored.as_ref(), seeds, root, device)?;
-    let guidance = scored.as_ref().map(|_| j.guidance.clone());
-    let spec = Spec { network: network.name(), sampler: j.sampler, rows: j.rows, guidance };
-    tce_base::begin_step("generated rows");
-    let stage = Stage::open(root, "stages/generated", &spec, device)?;
-    if let Some(reports) = stage.summary::<Vec<Generated>>()? {
-        return read(stage, reports, scored.is_some());
-    }
-    let attempt = stage.attempt()?;
-    let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
-    let units = &trained.units;
-    // Per member, under which scores its rows are drawn.
-    let under = scored.as_ref().map(|s| -> Vec<Vec<f32>> {
-        let best = best_percentiles(&s.source, j.guidance.from);
-        let draw = |u: Vec<f32>| draw_scores(&best, &u);
-        members.iter().map(|m| draw(uniform_labels(m, "joint", j.rows, 1.0))).collect()
-    });
-    let condition = match (&under, &trained.scores) {
-        (Some(scores), Some(units)) => units.conditions(&scores.concat()),
-        _ => vec![0.0; 2 * j.rows],
-    };
-    let guidance = under.as_ref().map(|_| j.guidance.weight).filter(|w| *w != 1.0);
-    let start =
-        start_rows(model.process(), || units.encode(&inputs.target.rows), units.live.len(), j.rows, &members, "joint");
-    let kept = Some(Chunks { directory: attempt.directory(), key: attempt.key() });
-    let request =
-        Request { name: "joint", rows: j.rows, condition: &condition, guidance, start: start.as_deref(), kept };
-    let bar = progress("sample transitions", j.rows * seeds.len(), &j.sampler);
-    let sampled = model.sample(request, &j.sampler, &members, Some(&bar))?;
-    bar.finish();
-    let mut reports = Vec::new();
-    for ((m, &seed), rows) in seeds.iter().enumerate().zip(sampled.chunks(j.rows * units.live.len())) {
-        let (table, kept, outside_box) = units.decode(rows);
-        if table.is_empty() {
-            return Err(Error::Failed(format!(
-                "seed {seed}: none of {} generated rows is finite; lower joint.learning_rate, or look for huge values in the data",
-                j.rows
-            )));
-        }
-        let file = format!("generated-seed{seed}.hdf5");
-        let attributes = BTreeMap::from([
-            ("spec".to_owned(), serde_json::to_string(&spec).expect("plain data")),
-            ("seed".to_owned(), seed.to_string()),
-        ]);
-        let scores = match (&scored, &under) {
-            (Some(scored), Some(_)) if j.guidance.rescore => {
-                let [rows, source, target] =
-                    [&table, inputs.source_rows()?, &inputs.target.rows].map(Rows::transitions);
-                Some(further_scores(&rows, &source, &target, &scored.scale, &j.scores, &score_streams())?)
-            }
-            (Some(_), Some(under)) => Some(kept.iter().map(|&i| under[m][i]).collect()),
-            _ => None,
-        };
-        let column = scores.as_deref().map(|s| (SCORE, s));
-        save_d4rl(&attempt.file(&file), &table, &attributes, column.as_slice())?;
-        reports.push(Generated {
-            file,
-            sampled: j.rows,
-            kept: table.len(),
-            outside_box,
-            terminal: table.terminals.iter().filter(|t| **t).count() as f64 / table.len() as f64,
-            evaluations: request.evaluations(&j.sampler),
-            labels: None,
-        });
-    }
-    drop(sampled);
-    let files: Vec<_> = reports.iter().map(|r| r.file.clone()).collect();
-    attempt.finish(&files, &reports)?;
-    // From the files, as every later run has them.
-    read(stage, reports, scored.is_some())
-}
-
-fn read(stage: Stage, reports: Vec<Generated>, scored: bool) -> Result<Expansion> {
-    let (mut tables, mut scores) = (Vec::new(), Vec::new());
-    for report in &reports {
-        let columns = if scored { vec![SCORE.to_owned()] } else { Vec::new() };
-        let mut loaded = load(&stage.file(&report.file), &LoadOptions { columns, ..LoadOptions::default() })?;
-        tables.push(Arc::new(loaded.transitions));
-        scores.push(loaded.columns.remove(SCORE).map(Arc::new));
-    }
-    Ok(Expansion { tables, scores, reports, stage })
 }
 
 #[cfg(test)]

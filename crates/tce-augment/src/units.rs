@@ -1,24 +1,8 @@
 //! Between the units of the data and those of the networks.
 
 use serde::{Deserialize, Serialize};
-use tce_data::{Rows, Standardizer, Support, Transitions};
+use tce_data::{Standardizer, Support, Transitions, even_standardizer};
 use tce_diffusion::Target;
-
-/// The map under which states of a half-and-half batch have zero mean and unit variance: target and other rows count the
-/// same, however many more of the others there are.
-pub fn even_standardizer(target: &Transitions, other: Option<&Transitions>) -> Standardizer {
-    let d = target.obs_dim;
-    let mut few = Vec::new();
-    if let Some(other) = other {
-        let n = target.len().min(other.len());
-        (0..n).for_each(|i| few.extend_from_slice(other.observation(i * other.len() / n)));
-    }
-    let mut tables = vec![Rows::new(&target.observations, d)];
-    if !few.is_empty() {
-        tables.push(Rows::new(&few, d));
-    }
-    Standardizer::fit_on(&tables)
-}
 
 /// Between the data's units and the networks'.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
