@@ -6,8 +6,8 @@ use tce_nn::{NamedParameters, NetworkError, Tensor};
 
 use crate::buffer::Minibatch;
 use crate::iql::Iql;
-use crate::policy::Policy;
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::policy::{Policy, PolicyLearner};
+use crate::training::{Learner, Meter};
 
 /// What a method does to a batch before IQL learns from it.
 pub trait Shape: Send {

@@ -6,8 +6,9 @@ use rayon::prelude::*;
 use tce_nn::{Device, Module, host};
 
 use crate::buffer::{Buffer, Pick};
+use crate::context_encoder::ContextEncoder;
 use crate::sequences::{Segments, Trajectories};
-use crate::world_model::{ContextEncoder, strip};
+use crate::world_model::strip;
 
 /// Whose rows are meant, and what their contexts come from.
 #[derive(Clone, Copy)]

@@ -22,8 +22,8 @@ use crate::actor::{Actor, ActorConfig, ActorNet, PolicyForm, PolicyOutput};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
-use crate::policy::Policy;
-use crate::training::{Learner, Meter, PolicyLearner, member_noise};
+use crate::policy::{Policy, PolicyLearner};
+use crate::training::{Learner, Meter, member_noise};
 
 /// Smoothing and delay; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -40,9 +40,9 @@ use crate::buffer::{Buffer, Minibatch, RewardScale};
 use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::losses::{AdvantageScale, AdvantageWeights, advantage_weights, expectile_loss, member_mean};
-use crate::policy::Policy;
+use crate::policy::{Policy, PolicyLearner};
 use crate::regulariser::{Regulariser, RegulariserKind};
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::training::{Learner, Meter};
 
 /// A weight below this does not move a policy.
 const DEAD_WEIGHT: f32 = 0.01;

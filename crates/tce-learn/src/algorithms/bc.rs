@@ -29,8 +29,8 @@ use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
-use crate::policy::Policy;
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::policy::{Policy, PolicyLearner};
+use crate::training::{Learner, Meter};
 
 /// The configuration of [`Bc`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

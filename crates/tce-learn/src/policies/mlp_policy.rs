@@ -16,7 +16,6 @@ use tce_data::Standardizer;
 use tce_nn::{Activation, Mlp, MlpConfig, Module, NamedParameters, cpu, host, tensor};
 
 use crate::error::LearnError;
-use crate::policy::Policy;
 
 /// Range of ln σ of a state-dependent Gaussian head.
 pub const LOG_STD_RANGE: (f32, f32) = (-20.0, 2.0);
@@ -237,18 +236,17 @@ impl MlpPolicy {
 }
 
 /// The policies of a population: member m gets the m-th network of `networks` and the m-th specification.
-pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -> Vec<Policy> {
+pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -> Vec<MlpPolicy> {
     let mut all = NamedParameters::default();
     all.collect(KEY, networks);
     let policy = |(m, spec)| MlpPolicy::new(spec, &all.member(m), KEY, Path::new("(in memory)"));
-    let made = |x| Policy::from(policy(x).expect("the networks were made from the specification"));
+    let made = |x| policy(x).expect("the networks were made from the specification");
     specs.into_iter().enumerate().map(made).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::policy::PolicyKind;
 
     fn spec(head: Head) -> PolicySpec {
         PolicySpec {
@@ -268,15 +266,10 @@ mod tests {
         }
     }
 
-    fn alone(policy: &Policy) -> MlpPolicy {
-        let PolicyKind::Mlp(policy) = policy.kind() else { panic!("{policy:?}") };
-        (**policy).clone()
-    }
-
     fn policy(head: Head) -> MlpPolicy {
         let spec = spec(head);
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
-        alone(&from_population(vec![spec], &network).remove(0))
+        from_population(vec![spec], &network).remove(0)
     }
 
     #[test]
@@ -284,7 +277,7 @@ mod tests {
         let tanh = PolicySpec { output_activation: Activation::Tanh, hidden: vec![16, 8], ..spec(Head::Mean) };
         let policies = [5, 6, 7].map(|seed| {
             let network = tanh.network().init(&[Streams::new(seed)], "policy", &cpu());
-            alone(&from_population(vec![tanh.clone()], &network).remove(0))
+            from_population(vec![tanh.clone()], &network).remove(0)
         });
         let average = MlpPolicy::average(&policies.iter().collect::<Vec<_>>());
         assert_eq!(average.spec().hidden, [48, 24]);

@@ -320,7 +320,7 @@ impl Actor {
                 spec.head = Head::Gaussian { log_std: values.to_vec() };
             }
         }
-        from_population(specs, &self.net.net().mlp)
+        from_population(specs, &self.net.net().mlp).into_iter().map(Policy::from).collect()
     }
 
     /// Adds parameters and optimiser to `state`.

@@ -38,10 +38,10 @@ use crate::buffer::{Buffer, Member, Minibatch};
 use crate::contexts::{Contexts, Of};
 use crate::error::{LearnError, within};
 use crate::networks::Dropout;
-use crate::policy::Policy;
+use crate::policy::{Policy, PolicyLearner};
 use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
 use crate::sequences::Segments;
-use crate::training::{Learner, Meter, Place, PolicyLearner, prepare};
+use crate::training::{Learner, Meter, Place, prepare};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
 use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
 

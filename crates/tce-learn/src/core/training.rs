@@ -11,7 +11,6 @@ use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, o
 
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
-use crate::policy::Policy;
 
 /// Losses and other figures are taken every so many steps: they cost time, and their means need no more. A prime, because what a
 /// method does at every second step is to be seen too.
@@ -122,12 +121,6 @@ pub trait Learner: Send {
     /// # Errors
     /// If it belongs to another learner.
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError>;
-}
-
-/// A learner whose result is one policy per member.
-pub trait PolicyLearner: Learner {
-    /// The policies as they are now, in the order of the members.
-    fn policies(&self) -> Vec<Policy>;
 }
 
 /// Draws of N(0, 1) `[P, rows, width]`, member m's from stream `index` of `name` of its own.

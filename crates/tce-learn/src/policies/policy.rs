@@ -16,8 +16,10 @@ use tce_data::ActionRange;
 use tce_nn::NamedParameters;
 
 use crate::error::LearnError;
+use crate::import::load_npz;
 use crate::mlp_policy::MlpPolicy;
 use crate::sequence_policy::{self, Recall, SequencePolicy};
+use crate::training::Learner;
 
 /// Key of the range of the actions in a policy file's metadata.
 const RANGE: &str = "action_range";
@@ -67,7 +69,7 @@ impl Policy {
             return Err(FileError::new(path, "read", io::Error::new(io::ErrorKind::IsADirectory, words)).into());
         }
         if path.extension().is_some_and(|e| e == "npz") {
-            return crate::import::load_npz(path);
+            return load_npz(path).map(Self::from);
         }
         if let Some(found) = other_format(path) {
             return Err(LearnError::Policy {
@@ -241,6 +243,12 @@ fn other_format(path: &Path) -> Option<&'static str> {
     }
 }
 
+/// A learner whose result is one policy per member.
+pub trait PolicyLearner: Learner {
+    /// The policies as they are now, in the order of the members.
+    fn policies(&self) -> Vec<Policy>;
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -262,7 +270,7 @@ mod tests {
             head: Head::Gaussian { log_std: vec![-0.1, 1.0 / 3.0] },
         };
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
-        from_population(vec![spec], &network).remove(0)
+        from_population(vec![spec], &network).remove(0).into()
     }
 
     #[test]

@@ -11,11 +11,11 @@ use tce_base::{Rng, Streams};
 use tce_nn::burn::module::{ModuleMapper, Param};
 use tce_nn::burn::nn::attention::MultiHeadAttention;
 use tce_nn::burn::nn::transformer::PositionWiseFeedForward;
-use tce_nn::burn::nn::{LayerNorm, Linear};
+use tce_nn::burn::nn::{Initializer, LayerNorm, Linear, LinearConfig};
 use tce_nn::burn::tensor::Bool;
 use tce_nn::burn::tensor::activation::softmax;
 use tce_nn::burn::tensor::{Tensor, TensorData};
-use tce_nn::{Activation, Module, dense, layer_norm};
+use tce_nn::{Activation, Device, Module, dense, layer_norm};
 
 /// How one parameter begins.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -154,6 +154,11 @@ pub(crate) fn attention(
     let weights = drop(softmax(scores.mask_fill(mask, layers.min_float), 3));
     let seen = weights.matmul(v).swap_dims(1, 2).reshape([batch, rows, width]);
     affine(&layers.output, seen, Activation::Identity)
+}
+
+/// A layer whose weights are drawn afterwards.
+pub(crate) fn linear(input: usize, output: usize, device: &Device) -> Linear {
+    LinearConfig::new(input, output).with_initializer(Initializer::Zeros).init(device)
 }
 
 #[cfg(test)]

@@ -22,8 +22,7 @@ use tce_nn::{Activation, Device, Module, Tensor};
 
 use serde::{Deserialize, Serialize};
 
-use crate::networks::{Dropout, Start, affine, attention, feed_forward, initialise, normalise};
-use crate::world_model::linear;
+use crate::networks::{Dropout, Start, affine, attention, feed_forward, initialise, linear, normalise};
 
 /// Standard deviation of a block's first weights (GPT-2's).
 const WEIGHT_STD: f32 = 0.02;

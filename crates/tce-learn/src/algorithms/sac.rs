@@ -36,8 +36,8 @@ use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
 use crate::mlp_policy::MlpPolicy;
-use crate::policy::Policy;
-use crate::training::{Learner, Meter, PolicyLearner};
+use crate::policy::{Policy, PolicyLearner};
+use crate::training::{Learner, Meter};
 
 /// The configuration of [`Sac`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

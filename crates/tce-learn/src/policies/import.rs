@@ -22,7 +22,6 @@ use zip::ZipArchive;
 use crate::error::LearnError;
 use crate::mlp_policy::{Head, MlpPolicy, PolicySpec};
 use crate::npy::{self, Array};
-use crate::policy::Policy;
 
 const REMEDY: &str = "see the table of kinds in the documentation of tce_learn::import";
 
@@ -30,7 +29,7 @@ const REMEDY: &str = "see the table of kinds in the documentation of tce_learn::
 ///
 /// # Errors
 /// If the file cannot be read, is of another kind, or lacks an array.
-pub fn load_npz(path: &Path) -> Result<Policy, LearnError> {
+pub fn load_npz(path: &Path) -> Result<MlpPolicy, LearnError> {
     let arrays = Arrays::read(path)?;
     let kind = arrays.text("kind")?;
     let wm = arrays.matrix("wm")?;
@@ -92,7 +91,7 @@ pub fn load_npz(path: &Path) -> Result<Policy, LearnError> {
         weights.tensors.insert(format!("policy.layers.{k}.bias"), (vec![1, 1, b.len()], b));
         weights.tensors.insert(format!("policy.layers.{k}.weight"), (vec![1, w.columns, w.rows], w.transposed()));
     }
-    Ok(MlpPolicy::new(spec, &weights, "policy", path)?.into())
+    MlpPolicy::new(spec, &weights, "policy", path)
 }
 
 /// A matrix `[rows, columns]`, row-major.

@@ -18,10 +18,10 @@ use tce_data::Standardizer;
 use tce_nn::burn::tensor::{Int, Tensor, TensorData};
 use tce_nn::{Module, NamedParameters, cpu, host, tensor};
 
+use crate::context_encoder::{ContextEncoder, EncoderSizes};
 use crate::error::LearnError;
 use crate::networks::Dropout;
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
-use crate::world_model::{ContextEncoder, EncoderSizes};
 
 /// Key of the specification in a policy file's metadata.
 pub(crate) const KEY: &str = "sequence_policy";

@@ -1,0 +1,202 @@
+#!/usr/bin/env python3
+"""Lists what is too large or goes in circles: python3 scripts/size.py [--all]
+
+Files of more than 500 lines, functions of more than 80 lines or with more than 7 parameters, cycles between the files of a crate (by the
+paths that begin with `crate::` and `super::`), and cycles between crates. Ends with 1 if there is any that the list `ALLOWED` does not
+name with a reason, or if the list names one that is gone. `--all` prints the allowed ones, too. Only Python's standard library.
+"""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+LINES, FUNCTION, PARAMETERS = 500, 80, 7
+
+# What stays as it is, and why. A key is what the script prints.
+ALLOWED = {}
+
+
+def main():
+    findings = {}
+    crates = sorted(p.parent for p in ROOT.glob("crates/*/Cargo.toml"))
+    for crate in crates:
+        files = {path: path.read_text() for path in sorted(crate.glob("src/**/*.rs"))}
+        for path, text in files.items():
+            name = path.relative_to(ROOT).as_posix()
+            lines = text.count("\n")
+            if lines > LINES:
+                findings[name] = f"{lines} lines"
+            for function, length, parameters in functions(code_only(text)):
+                if length > FUNCTION:
+                    findings[f"{name}: fn {function}"] = f"{length} lines"
+                if parameters > PARAMETERS:
+                    findings[f"{name}: fn {function}()"] = f"{parameters} parameters"
+        for cycle in cycles(imports(crate / "src", files)):
+            names = " ".join(sorted(p.relative_to(crate / "src").as_posix() for p in cycle))
+            findings[f"{crate.name}: {names}"] = "files in a cycle"
+    for cycle in cycles(dependencies(crates)):
+        findings["crates: " + " ".join(sorted(cycle))] = "crates in a cycle"
+    new = {key: what for key, what in findings.items() if key not in ALLOWED}
+    gone = [key for key in ALLOWED if key not in findings]
+    for key, what in new.items():
+        print(f"{what}: {key}")
+    for key in gone:
+        print(f"allowed, but not found any more: {key}")
+    if "--all" in sys.argv:
+        for key, reason in ALLOWED.items():
+            print(f"allowed ({findings.get(key, 'gone')}): {key}: {reason}")
+    print(f"{len(new)} found, {len(findings) - len(new)} allowed", file=sys.stderr)
+    sys.exit(1 if new or gone else 0)
+
+
+def code_only(text):
+    """The text with blanks in place of comments and the inside of strings, so that braces and commas in them do not count."""
+
+    def blank(match):
+        return re.sub(r"[^\n]", " ", match[0])
+
+    pattern = r'//[^\n]*|/\*.*?\*/|b?r#*"(?:.*?)"#*|b?"(?:\\.|[^"\\])*"|b?\'(?:\\.|[^\'\\])\''
+    return re.sub(pattern, blank, text, flags=re.DOTALL)
+
+
+def functions(text):
+    """(name, lines, parameters) of every function with a body."""
+    for match in re.finditer(r"\bfn\s+(\w+)", text):
+        i = match.end()
+        if i < len(text) and text[i] == "<":
+            i = closing(text, i, "<", ">") + 1
+        start = text.find("(", i)
+        if start < 0:
+            continue
+        end = closing(text, start, "(", ")")
+        body = re.compile(r"[{;]").search(text, end)
+        if not body or body[0] == ";":
+            continue
+        last = closing(text, body.start(), "{", "}")
+        line = text.rfind("\n", 0, match.start())
+        yield match[1], text.count("\n", line + 1, last) + 1, parameters(text[start + 1 : end])
+
+
+def parameters(text):
+    """Parameters between a function's brackets, without `self`."""
+    depth, count, part = 0, 0, ""
+    for character in text + ",":
+        if character == "," and depth == 0:
+            if part.strip() and not re.fullmatch(r"\s*(&\s*('\w+\s+)?)?(mut\s+)?self\s*", part):
+                count += 1
+            part = ""
+            continue
+        depth += (character in "([{<") - (character in ")]}>")
+        part += character
+    return count
+
+
+def closing(text, start, opens, closes):
+    """Where the bracket at `start` is closed; `->` closes nothing."""
+    depth = 0
+    for i in range(start, len(text)):
+        if text[i] == opens:
+            depth += 1
+        elif text[i] == closes and text[i - 1] not in "-=":
+            depth -= 1
+            if depth == 0:
+                return i
+    return len(text) - 1
+
+
+def imports(src, files):
+    """For every file of a crate, the files whose items it names. A parent that only declares or re-exports its children needs none of them."""
+    modules = {module_of(src, path): path for path in files}
+    graph = {path: set() for path in files}
+    for path, text in files.items():
+        text = re.sub(r"#\[cfg\(test\)\]\s*mod \w+ \{.*", "", code_only(text), flags=re.DOTALL)
+        here = module_of(src, path)
+        re_exports = re.findall(r"^pub(?:\(\w+\))? use ([^;]+);", text, re.MULTILINE)
+        for use in re_exports:
+            text = text.replace(use, "", 1)
+        for target in paths(text):
+            parts = target.split("::")
+            if parts[0] == "crate":
+                parts = parts[1:]
+            else:
+                base = list(here)
+                while parts and parts[0] == "super":
+                    base, parts = base[:-1], parts[1:]
+                parts = base + parts
+            # The longest prefix that is a file; `crate::Item` is what lib.rs re-exports, which is no file of its own.
+            while parts and tuple(parts) not in modules:
+                parts = parts[:-1]
+            found = modules.get(tuple(parts))
+            if found and parts and found != path:
+                graph[path].add(found)
+    return graph
+
+
+def module_of(src, path):
+    """The module's path, as a tuple of names."""
+    parts = path.relative_to(src).with_suffix("").parts
+    return tuple(parts[:-1] if parts[-1] in ("mod", "lib", "main") else parts)
+
+
+def paths(text):
+    """All paths that begin with `crate::` or `super::`, with the lists in braces written out."""
+    for match in re.finditer(r"\b(crate|super)::", text):
+        yield from expanded(text, match.start())
+
+
+def expanded(text, start):
+    prefix = re.compile(r"(?:\w+::)*").match(text, start)[0]
+    i = start + len(prefix)
+    if i < len(text) and text[i] == "{":
+        end = closing(text, i, "{", "}")
+        depth, part = 0, ""
+        for character in text[i + 1 : end] + ",":
+            if character == "," and depth == 0:
+                if part.strip():
+                    yield from expanded(prefix + part.strip(), 0)
+                part = ""
+                continue
+            depth += (character == "{") - (character == "}")
+            part += character
+    else:
+        name = re.compile(r"\w*").match(text, i)[0]
+        yield (prefix + name).rstrip(":")
+
+
+def dependencies(crates):
+    names = {crate.name for crate in crates}
+    return {c.name: set(tomllib.loads((c / "Cargo.toml").read_text()).get("dependencies", {})) & names for c in crates}
+
+
+def cycles(graph):
+    """Strongly connected parts of more than one node (Tarjan)."""
+    index, low, stack, out = {}, {}, [], []
+
+    def visit(node):
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in sorted(graph[node]):
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            part = []
+            while True:
+                part.append(stack.pop())
+                if part[-1] == node:
+                    break
+            if len(part) > 1:
+                out.append(part)
+
+    for node in sorted(graph):
+        if node not in index:
+            visit(node)
+    return out
+
+
+if __name__ == "__main__":
+    main()
