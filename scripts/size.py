@@ -107,31 +107,58 @@ def closing(text, start, opens, closes):
 
 
 def imports(src, files):
-    """For every file of a crate, the files whose items it names. A parent that only declares or re-exports its children needs none of them."""
+    """For every file of a crate, the files whose items it names, through re-exports, too. What a parent only re-exports of its children it
+    does not need."""
     modules = {module_of(src, path): path for path in files}
-    graph = {path: set() for path in files}
+    texts = {}
+    named = {}
     for path, text in files.items():
-        text = re.sub(r"#\[cfg\(test\)\]\s*mod \w+ \{.*", "", code_only(text), flags=re.DOTALL)
         here = module_of(src, path)
-        re_exports = re.findall(r"^pub(?:\(\w+\))? use ([^;]+);", text, re.MULTILINE)
-        for use in re_exports:
-            text = text.replace(use, "", 1)
-        for target in paths(text):
-            parts = target.split("::")
-            if parts[0] == "crate":
-                parts = parts[1:]
+        text = code_only(re.sub(r"#\[cfg\(test\)\]\s*mod tests? \{.*", "", text, flags=re.DOTALL))
+        for match in re.finditer(r"^(?:pub(?:\(\w+\))? )?use ([^;]+);", text, re.MULTILINE):
+            if match[0].startswith("pub") or here == ():
+                for target in expanded(re.sub(r"\s+", " ", match[1]), 0):
+                    target, _, alias = target.partition(" as ")
+                    parts = absolute(target.split("::"), here, modules)
+                    if parts:
+                        named[(*here, alias or parts[-1])] = parts
+                text = text.replace(match[0], "", 1)
+        texts[path] = text
+
+    def file_of(parts):
+        at, steps = (), 0
+        parts = list(parts)
+        while parts and steps < 20:
+            steps += 1
+            if (*at, parts[0]) in modules:
+                at = (*at, parts.pop(0))
+            elif (*at, parts[0]) in named:
+                target = named[(*at, parts.pop(0))]
+                at, parts = (), [*target, *parts]
             else:
-                base = list(here)
-                while parts and parts[0] == "super":
-                    base, parts = base[:-1], parts[1:]
-                parts = base + parts
-            # The longest prefix that is a file; `crate::Item` is what lib.rs re-exports, which is no file of its own.
-            while parts and tuple(parts) not in modules:
-                parts = parts[:-1]
-            found = modules.get(tuple(parts))
-            if found and parts and found != path:
+                break
+        return modules.get(at) if at else None
+
+    graph = {path: set() for path in files}
+    for path, text in texts.items():
+        here = module_of(src, path)
+        for target in paths(text):
+            found = file_of(absolute(target.split("::"), here, modules) or [])
+            if found and found != path:
                 graph[path].add(found)
     return graph
+
+
+def absolute(parts, here, modules):
+    """A path's parts from the crate's root; None for another crate's."""
+    if parts[0] == "crate":
+        return parts[1:]
+    if parts[0] in ("super", "self"):
+        base = list(here)
+        while parts and parts[0] in ("super", "self"):
+            base, parts = base[:-1] if parts[0] == "super" else base, parts[1:]
+        return base + parts
+    return [*here, *parts] if (*here, parts[0]) in modules else None
 
 
 def module_of(src, path):
@@ -161,7 +188,7 @@ def expanded(text, start):
             depth += (character == "{") - (character == "}")
             part += character
     else:
-        name = re.compile(r"\w*").match(text, i)[0]
+        name = re.compile(r"\w*(?: as \w+)?").match(text, i)[0]
         yield (prefix + name).rstrip(":")
 
 

@@ -12,6 +12,7 @@ pub mod random;
 pub mod scratch;
 pub mod sealed;
 pub mod statistics;
+pub mod terminal;
 pub mod words;
 
 pub use course::{Headline, Step, begin_step, end_course, plan_course};
@@ -22,11 +23,12 @@ pub use files::{
 pub use interrupt::{interrupted, listen_for_interrupts};
 pub use metrics::Metrics;
 pub use owner::Owner;
-pub use progress::{Progress, set_quiet};
+pub use progress::Progress;
 pub use random::{Rng, Streams};
 pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use statistics::{mean_std, plus_minus};
+pub use terminal::set_quiet;
 pub use words::{did_you_mean, file_inside, nearest};
 
 /// What files say about who wrote them.

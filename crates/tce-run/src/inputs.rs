@@ -11,8 +11,8 @@ use tce_data::{
     Transitions, choose_trajectories, ensure_same_agent, infer_agents, load, main_file, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
-use tce_zoo::actors::{Cast, Recipe};
 use tce_zoo::exhibits;
+use tce_zoo::recipes::{Cast, Recipe};
 use tce_zoo::stand_ins::{self, shared_folder};
 
 use crate::config::{Algorithm, Config, LearnerConfig, TargetConfig, Trajectories};

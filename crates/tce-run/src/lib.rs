@@ -20,6 +20,7 @@ pub mod recipe;
 pub mod stage;
 pub mod study;
 pub mod sweep;
+mod titles;
 pub mod variant;
 pub mod verdict;
 pub mod wrong_keys;

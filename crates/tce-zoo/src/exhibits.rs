@@ -13,8 +13,8 @@ use tce_data::{Agent, Shift};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
 
-use crate::actors::{Cast, Part};
 use crate::error::{Error, Result};
+use crate::recipes::{Cast, Part};
 
 static FILES: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/zoo");
 

@@ -4,6 +4,7 @@
 pub mod actors;
 mod error;
 pub mod exhibits;
+pub mod recipes;
 pub mod sac_training;
 pub mod stand_ins;
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use tce_data::Agent;
 
-use crate::actors::{Cast, Part};
+use crate::recipes::{Cast, Part};
 
 /// The folder with stand-in actors and the public target sets: `TCE_SHARED`, by default `../shared`.
 pub fn shared_folder() -> PathBuf {

@@ -9,7 +9,8 @@ use std::cell::LazyCell;
 
 use rayon::prelude::*;
 
-use super::report::{Dropped, EpisodeEnds, Successors};
+use super::marks::{Resolved, Table};
+use super::report::{EpisodeEnds, Successors};
 use super::rows::tell;
 use super::steps::{Steps, doubts, in_place};
 
@@ -17,39 +18,6 @@ use super::steps::{Steps, doubts, in_place};
 const MOST_ENVIRONMENTS: usize = 1024;
 /// Rows that are looked at for a column's scale.
 const SAMPLE: usize = 20_000;
-
-/// What a file says row by row, before anything is dropped.
-pub(super) struct Table<'a> {
-    pub dim: usize,
-    pub observations: &'a [f32],
-    /// Stored successors, if there are any.
-    pub next_observations: Option<&'a [f32]>,
-    pub terminals: &'a [bool],
-    pub timeouts: Option<&'a [bool]>,
-    /// Steps after which the collector cut an episode.
-    pub limit: Option<usize>,
-}
-
-/// What is made of it.
-#[derive(Debug, PartialEq)]
-pub(super) struct Resolved {
-    pub timeouts: Vec<bool>,
-    /// Rows that stay.
-    pub keep: Vec<bool>,
-    /// Rows whose successor is known. The others are terminal.
-    pub known: Vec<bool>,
-    pub successors: Successors,
-    pub ends: EpisodeEnds,
-    pub dropped: Dropped,
-    pub warnings: Vec<String>,
-}
-
-impl Resolved {
-    fn new(timeouts: Vec<bool>, successors: Successors, ends: EpisodeEnds) -> Self {
-        let (keep, known) = (vec![true; timeouts.len()], vec![true; timeouts.len()]);
-        Self { timeouts, keep, known, successors, ends, dropped: Dropped::default(), warnings: Vec::new() }
-    }
-}
 
 /// Whether two states are the same, up to how they are rounded.
 ///

@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 
 use super::formats::{Format, Raw};
 use super::hdf5::{Column, Hdf5};
-use super::load::LoadOptions;
+use super::options::LoadOptions;
 use super::report::Layout;
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem};

@@ -1,7 +1,5 @@
 //! Every figure of a diagnosis.
 
-use std::path::Path;
-
 use rand::seq::SliceRandom;
 use tce_augment::score_training::held_out_rows;
 use tce_augment::units::Units;
@@ -19,8 +17,9 @@ use tce_zoo::actors::Arena;
 
 use super::implied::{DRAWS, ImpliedActor, implied_actions, rollout_implied};
 use super::models::{Models, finite};
-use super::rows::{Batch, Sampler};
-use super::{Options, Subject, generator};
+use super::rows::Batch;
+use super::work::{Sources, Work, few};
+use super::{Subject, generator};
 use crate::config::SourceRows;
 use crate::error::Result;
 use crate::mixture::distances;
@@ -36,27 +35,6 @@ const POINTS: usize = 400;
 const SOURCES: usize = 20_000;
 /// The share of source rows that is called nearest where the run itself has no λ.
 const NEAREST: f64 = 0.05;
-
-/// A diagnosis under way.
-pub struct Work<'a> {
-    pub subject: &'a Subject<'a>,
-    pub options: &'a Options,
-    pub root: &'a Path,
-    pub sampler: &'a Sampler<'a>,
-    pub simulator: Option<(tce_data::Agent, tce_data::Shift)>,
-}
-
-/// Source rows that stand for all of them.
-pub struct Sources {
-    /// Those that are measured, the nearest to the target first.
-    pub sorted: Transitions,
-    /// The episode that each of them is of.
-    episodes: Vec<usize>,
-    /// Some of the nearest share.
-    nearest: Transitions,
-    /// None of those that are measured: what models may learn from.
-    pub others: Transitions,
-}
 
 /// Equally many states of each domain that coverage is counted over, and target rows that are none of them.
 struct References {
@@ -521,14 +499,6 @@ impl Figures {
             consistency: self.consistency.as_ref().and_then(chosen),
         }
     }
-}
-
-/// `count` rows at random, in their order.
-pub fn few(t: &Transitions, count: usize, streams: &Streams, name: &str) -> Transitions {
-    if t.len() <= count {
-        return t.clone();
-    }
-    t.select(&choose(&mut streams.stream(name), t.len(), count))
 }
 
 /// Two halves of the rows in whole episodes, drawn at random, and whether that could be: where one would have less than a third of the rows,

@@ -36,9 +36,10 @@ pub mod implied;
 pub(crate) mod measures;
 mod models;
 mod rows;
+mod work;
 
-use measures::Work;
 use rows::Sampler;
+use work::Work;
 
 /// Changes when the same rows would give other figures.
 const VERSION: u32 = 5;

@@ -26,8 +26,8 @@ use tce_learn::{
 use tce_nn::Device;
 use tce_sim::{Simulated, simulate, terminal_rule};
 
-use super::measures::{Sources, Work, few};
 use super::rows::Batch;
+use super::work::{Sources, Work, few};
 use crate::error::{Error, Result};
 use crate::stage::Attempt;
 

@@ -8,8 +8,8 @@ use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, parse_environment,
 use tce_run::error::{Error, Result};
 use tce_run::inputs::d4rl_recipe;
 use tce_sim::EPISODE_LIMIT;
-use tce_zoo::actors::{Part, Recipe};
 use tce_zoo::exhibits;
+use tce_zoo::recipes::{Part, Recipe};
 
 use crate::output::{Output, table};
 
