@@ -1,44 +1,20 @@
 //! The two data sets of a run: found, loaded, and refused together if they do not fit.
 
 use std::borrow::Cow;
-use std::collections::HashSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::Serialize;
-use tce_base::sha256_file;
 use tce_data::{
-    ActionRange, Agent, Choice, LoadOptions, Loaded, Quality, ReferenceScores, ScoreTable, Shift, Standardizer, Task,
-    Transitions, choose_trajectories, ensure_same_agent, infer_agents, load, main_file, reference_scores,
+    ActionRange, Agent, Choice, ReferenceScores, ScoreTable, Shift, Task, Transitions, choose_trajectories,
+    ensure_same_agent, infer_agents, reference_scores,
 };
 use tce_sim::EPISODE_LIMIT;
-use tce_zoo::exhibits;
-use tce_zoo::recipes::{Cast, Recipe};
-use tce_zoo::stand_ins::{self, shared_folder};
 
 use crate::config::{Algorithm, Config, LearnerConfig, TargetConfig, Trajectories};
 use crate::error::{Error, Result};
 use crate::own::{Own, range_of};
-
-/// Below this, nothing can be held out and nothing be learned.
-const LEAST_ROWS: usize = 10;
-
-/// The files of a benchmark task, and where results go.
-#[derive(Clone, Debug, clap::Args)]
-#[command(next_help_heading = "Data")]
-pub struct DataArgs {
-    /// Source data (default: collected from the zoo's actors, or from those in TCE_SHARED where the zoo lacks one).
-    #[arg(long, value_name = "FILE")]
-    pub source: Option<PathBuf>,
-    /// Target data (default: OTDF's public file if TCE_SHARED has it, otherwise collected from the zoo's actors).
-    #[arg(long, value_name = "FILE")]
-    pub target: Option<PathBuf>,
-    /// Do not look into TCE_SHARED: what is not given as a file is collected from the zoo.
-    #[arg(long)]
-    pub from_zoo: bool,
-    /// Where results and finished stages are kept.
-    #[arg(long, default_value = "runs")]
-    pub out: PathBuf,
-}
+pub use crate::tables::{Behaviour, Table};
+pub use crate::task_data::{DataArgs, d4rl_recipe, ensure_data, source_file, target_file};
 
 /// Source and target, and what is known about where they come from.
 #[derive(Debug)]
@@ -57,142 +33,6 @@ pub struct Inputs {
     pub actions: Option<ActionRange>,
     /// The collector's step limit, where the user gave one.
     limit: Option<usize>,
-}
-
-/// A loaded file.
-#[derive(Debug)]
-pub struct Table {
-    /// The rows whose successor is known.
-    pub rows: Transitions,
-    /// All rows, where there are terminal ones without a successor among them.
-    complete: Option<Transitions>,
-    /// All rows' actions as the file has them, where they were scaled.
-    own_actions: Option<Vec<f32>>,
-    /// The file.
-    pub file: PathBuf,
-    /// SHA-256 of the file, and how many of its rows these are, if not all.
-    pub hash: String,
-}
-
-/// What a data set is, and how good the policy was that collected it.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Behaviour {
-    /// The file.
-    pub file: PathBuf,
-    /// Its rows.
-    pub rows: usize,
-    /// Whole episodes.
-    pub episodes: usize,
-    /// Their mean return.
-    pub mean: f64,
-    /// The spread of their returns.
-    pub std: f64,
-    /// The mean return, normalised in the domain that the rows come from; None if no episode came to its end.
-    pub score: Option<f64>,
-}
-
-impl Table {
-    fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
-        let (loaded, hash) = Self::loaded(path, options)?;
-        Ok(Self::new(loaded.transitions, path, hash))
-    }
-
-    /// What is in the file, which is told, and the file's hash.
-    fn loaded(path: &Path, options: &LoadOptions) -> Result<(Loaded, String)> {
-        let loaded = load(path, options)?;
-        tce_base::note!("{}", loaded.report);
-        Ok((loaded, sha256_file(&main_file(path))?))
-    }
-
-    /// The rows of a file that are not the target's. `tce augment` writes those beside the generated ones, and a learner that takes half of
-    /// every batch from the target would see them twice.
-    fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
-        let options = LoadOptions { all_columns: true, ..options.clone() };
-        let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
-        let bits = |t: &Transitions, i: usize| -> Vec<u32> {
-            let parts = [t.observation(i), t.action(i), t.next_observation(i)];
-            parts.into_iter().flatten().map(|x| x.to_bits()).collect()
-        };
-        let own = target.complete();
-        let known: HashSet<Vec<u32>> = (0..own.len()).map(|i| bits(own, i)).collect();
-        let origin = columns.get("origin");
-        let is_target =
-            |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&transitions, i).as_slice());
-        let others: Vec<usize> = (0..transitions.len()).filter(|&i| !is_target(i)).collect();
-        if others.len() == transitions.len() {
-            return Ok(Self::new(transitions, path, hash));
-        }
-        if others.is_empty() {
-            return Err(Error::Usage(format!(
-                "{}: found the rows of {} alone, expected others; leave out --extra, or give a file with generated or source rows",
-                path.display(),
-                target.file.display()
-            )));
-        }
-        let left_out = transitions.len() - others.len();
-        tce_base::note!(
-            "{}: {left_out} of its {} rows are target rows and are left out, for --target brings them",
-            path.display(),
-            transitions.len()
-        );
-        Ok(Self::new(transitions.select(&others), path, format!("{hash}, without {left_out} target rows")))
-    }
-
-    fn new(rows: Transitions, file: &Path, hash: String) -> Self {
-        let (rows, complete) = match rows.with_successors() {
-            Cow::Borrowed(_) => (rows, None),
-            Cow::Owned(known) => (known, Some(rows)),
-        };
-        Self { rows, complete, own_actions: None, file: file.to_owned(), hash }
-    }
-
-    /// Refuses rows of which nothing can be learned.
-    fn usable(&self) -> Result<()> {
-        let refuse = |found: String, expected: &str| {
-            let file = self.file.display();
-            Err(Error::Failed(format!("{file}: found {found}, expected {expected}; record more of this robot")))
-        };
-        if self.rows.len() < LEAST_ROWS {
-            return refuse(format!("{} rows with a next state", self.rows.len()), &format!("at least {LEAST_ROWS}"));
-        }
-        let varies = |values: &[f32], dim: usize| Standardizer::fit(values, dim).dead.len() < dim;
-        if !varies(&self.rows.observations, self.rows.obs_dim) {
-            return refuse("states that never change".into(), "at least one column of `observations` that does");
-        }
-        let pairs = self.rows.next_observations.iter().zip(&self.rows.observations);
-        if pairs.clone().all(|(next, state)| next == state) {
-            return refuse("next states that are the states".into(), "a robot that moves");
-        }
-        Ok(())
-    }
-
-    /// Whether rows follow each other: half of them do at least.
-    pub fn has_episodes(&self) -> bool {
-        2 * self.complete().episodes().len() <= self.complete().len()
-    }
-
-    /// All rows, for whoever learns without looking at s' where an episode ended.
-    pub fn complete(&self) -> &Transitions {
-        self.complete.as_ref().unwrap_or(&self.rows)
-    }
-
-    fn scale(&mut self, range: &ActionRange) {
-        range.to_unit(&mut self.rows.actions);
-        self.complete.iter_mut().for_each(|t| range.to_unit(&mut t.actions));
-    }
-
-    fn behaviour(&self, reference: Option<ReferenceScores>, limit: Option<usize>) -> Behaviour {
-        let content = tce_data::inspect(self.complete(), limit);
-        let (returns, score) = (&content.returns, content.normalised_score(reference));
-        Behaviour {
-            file: self.file.clone(),
-            rows: self.rows.len(),
-            episodes: returns.count,
-            mean: returns.mean,
-            std: returns.std,
-            score,
-        }
-    }
 }
 
 /// What identifies the inputs in a specification.
@@ -474,98 +314,6 @@ impl Inputs {
     pub fn reference(&self, table: ScoreTable) -> Option<ReferenceScores> {
         reference_scores(self.agent?, self.shift?, table)
     }
-}
-
-/// Where the data of a task come from.
-enum Origin {
-    /// A file that is there.
-    File(PathBuf),
-    /// Actors that collect it.
-    Collected(Recipe),
-}
-
-fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
-    let Task { agent, shift, target, .. } = task;
-    let public = task.target_file(&shared_folder());
-    match &args.target {
-        Some(path) => Ok(Origin::File(path.clone())),
-        None if !args.from_zoo && public.exists() => Ok(Origin::File(public)),
-        None => {
-            let recipe = exhibits::cast(agent, shift)?.target(agent, shift, target, 0);
-            Ok(Origin::Collected(recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?))
-        }
-    }
-}
-
-fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
-    match &args.source {
-        Some(path) => Ok(Origin::File(path.clone())),
-        None => Ok(Origin::Collected(d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?)),
-    }
-}
-
-/// The target data of a task, collected now if it has to be; see [`Inputs::of_task`].
-///
-/// # Errors
-/// If the zoo lacks an actor, or the rows cannot be written.
-pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
-    match target_origin(task, args)? {
-        Origin::File(path) => Ok(path),
-        Origin::Collected(recipe) => collected(&recipe, task.target, args),
-    }
-}
-
-/// The source data of a task, of which `rows` is the size of a medium set, collected now if it has to be.
-///
-/// # Errors
-/// As for [`target_file`].
-pub fn source_file(task: Task, args: &DataArgs, rows: usize) -> Result<PathBuf> {
-    match source_origin(task, args, rows)? {
-        Origin::File(path) => Ok(path),
-        Origin::Collected(recipe) => collected(&recipe, task.source, args),
-    }
-}
-
-/// Whether the data of a task can be had; of the source only where `source_rows` are needed. Nothing is collected.
-///
-/// # Errors
-/// What is missing, and where it was looked for.
-pub fn ensure_data(task: Task, args: &DataArgs, source_rows: Option<usize>) -> Result<()> {
-    let origins = std::iter::once(target_origin(task, args)).chain(source_rows.map(|n| source_origin(task, args, n)));
-    for origin in origins {
-        if let Origin::File(path) = origin?
-            && !path.exists()
-        {
-            return Err(Error::missing(&path, format!("there is no such file; {task} needs it")));
-        }
-    }
-    Ok(())
-}
-
-fn collected(recipe: &Recipe, quality: Quality, args: &DataArgs) -> Result<PathBuf> {
-    Ok(recipe.cached(&args.out.join("data"), &format!("{}-{}-{quality}", recipe.agent, recipe.shift))?)
-}
-
-/// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo
-/// lacks, unless `from_zoo`.
-///
-/// # Errors
-/// If an actor is missing in both.
-pub fn d4rl_recipe(agent: Agent, quality: Quality, rows: usize, seed: u64, from_zoo: bool) -> Result<Recipe> {
-    let of = |cast: Cast| cast.source(agent, Shift::Source, quality, rows, seed);
-    let recipe = of(exhibits::cast(agent, Shift::Source)?);
-    let recipe = recipe.or_else(|| if from_zoo { None } else { of(stand_ins::cast(agent, &shared_folder())) });
-    recipe.ok_or_else(|| missing(Shift::Source, quality, agent, "--source"))
-}
-
-fn missing(shift: Shift, quality: Quality, agent: Agent, option: &str) -> Error {
-    Error::missing(
-        &shared_folder(),
-        format!(
-            "no {quality} data of {agent}-{shift}: the zoo has no actors for it (tce zoo list), and neither has this folder; \
-             give a file with {option}, or set TCE_SHARED to the folder that holds datasets/otdf and policies"
-        ),
-    )
 }
 
 #[cfg(test)]

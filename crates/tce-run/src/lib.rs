@@ -20,6 +20,8 @@ pub mod recipe;
 pub mod stage;
 pub mod study;
 pub mod sweep;
+pub mod tables;
+pub mod task_data;
 mod titles;
 pub mod variant;
 pub mod verdict;

@@ -1,15 +1,13 @@
 //! Every figure of a diagnosis.
 
-use rand::seq::SliceRandom;
 use tce_augment::score_training::held_out_rows;
 use tce_augment::units::Units;
-use tce_base::random::choose;
 use tce_base::{Streams, begin_step};
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
-    AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied,
-    Labels, Rated, Reliability, Sampled, Spread, coverage, gaussian, memorisation,
+    AtBound, Bounds, Choice, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied, Labels, Rated,
+    Reliability, Sampled, Spread, gaussian, memorisation,
 };
 use tce_learn::{Densities, rmse};
 use tce_nn::Device;
@@ -17,52 +15,28 @@ use tce_zoo::actors::Arena;
 
 use super::implied::{DRAWS, ImpliedActor, implied_actions, rollout_implied};
 use super::models::{Models, finite};
+use super::notes::{left_out, lost, of_references, without_simulator};
+use super::references::References;
 use super::rows::Batch;
 use super::work::{Sources, Work, few};
 use super::{Subject, generator};
-use crate::config::SourceRows;
 use crate::error::Result;
-use crate::mixture::distances;
 
-/// Reference states of each domain behind a coverage.
-const REFERENCE: usize = 2000;
 /// The steps of a diagnosis, after those of the run.
 pub const PARTS: [&str; 5] =
     ["rows to measure", "transition models", "coverage and reliability", "choice of λ", "pictures and implied policy"];
 /// Points of each group in a picture.
 const POINTS: usize = 400;
-/// Source rows behind Theorem 1.
-const SOURCES: usize = 20_000;
-/// The share of source rows that is called nearest where the run itself has no λ.
-const NEAREST: f64 = 0.05;
-
-/// Equally many states of each domain that coverage is counted over, and target rows that are none of them.
-struct References {
-    rows: usize,
-    target: coverage::Reference,
-    source: Option<coverage::Reference>,
-    other_target: Transitions,
-    /// Whether the other target rows are of other episodes.
-    by_episode: bool,
-}
-
-impl References {
-    /// Coverage by `covering`; None if they are fewer than the reference rows.
-    fn covered_by(&self, covering: &Transitions, units: &Units, streams: &Streams) -> Result<Option<Coverage>> {
-        if covering.len() < self.rows {
-            return Ok(None);
-        }
-        let states = units.states(&few(covering, self.rows, streams, "covering").observations);
-        let source = self.source.as_ref().map(|s| s.covered_by(&states)).transpose()?;
-        Ok(Some(Coverage { target: self.target.covered_by(&states)?, source }))
-    }
+/// What every label bound is measured by.
+struct Measured<'a> {
+    models: &'a Models,
+    references: Option<&'a References>,
+    held_out: Option<&'a memorisation::HeldOut>,
+    step: &'a [f32],
+    streams: &'a Streams,
 }
 
 impl Work<'_> {
-    fn units(&self) -> &Units {
-        &self.sampler.generator.units
-    }
-
     /// Trains the models, and measures.
     pub fn done(
         &self,
@@ -84,65 +58,34 @@ impl Work<'_> {
         let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
         let own = &batches[at(config.generator.y_max)];
         own.ensure_kept(&config.filter)?;
-        for (y, batch) in grid.iter().zip(&batches).filter(|(_, b)| b.lost > 0) {
-            notes.push(format!(
-                "{} of {} rows generated with y_max = {y} hold numbers that are not finite. They count as rejected, and are part of no \
-                 other figure.",
-                batch.lost, options.rows
-            ));
-        }
+        notes.extend(lost(grid.iter().zip(&batches), options.rows));
         let sources = self.sources(&streams)?;
         begin_step(PARTS[1]);
         let models = Models::train(self, sources.as_ref(), own, *grid.last().expect("a grid"), attempt, device)?;
-        if self.simulator.is_none() {
-            let why =
-                if options.simulator { "its task is not one of the benchmark's" } else { "it was not to be used" };
-            notes.push(format!(
-                "Without the simulator ({why}) there are no abundant target rows: no transition KL, no reward error, no consistency, \
-                 and Theorem 1 by models of the target rows alone."
-            ));
-        }
+        notes.extend(self.simulator.is_none().then(|| without_simulator(options.simulator)));
         begin_step(PARTS[2]);
         // As many as every bound has, but for those of which the filter leaves next to nothing.
         let kept = batches.iter().map(Batch::kept).filter(|k| 2 * k >= own.kept()).min().expect("the run's own");
         let references = self.references(&streams, sources.as_ref(), kept)?;
-        match &references {
-            None => notes.push("There are too few rows for a coverage.".into()),
-            Some(r) if !r.by_episode => notes.push(
-                "The target's episodes cannot be split into halves: its coverage by other target rows is by rows of the same episodes, \
-                 and more than fresh rows would cover."
-                    .into(),
-            ),
-            Some(_) => (),
-        }
-        let covered =
-            |rows: &Transitions| references.as_ref().map_or(Ok(None), |r| r.covered_by(rows, self.units(), &streams));
-        let covered_by_target = references.as_ref().map_or(Ok(None), |r| covered(&r.other_target))?;
+        notes.extend(of_references(references.as_ref()).map(str::to_owned));
+        let by_target = |r: &References| r.covered_by(&r.other_target, self.units(), &streams);
+        let covered_by_target = references.as_ref().map_or(Ok(None), by_target)?;
         let held_out = self.held_out()?;
         if held_out.is_none() {
             notes.push("One episode has most of the target rows: there are no held-out rows to tell copies by.".into());
         }
         let distances = self.distances_to_real(&batches)?;
         let step = generator::step_std(target, &self.units().live);
-        let mut bounds_of_y = Vec::new();
-        for ((&y, batch), distances) in grid.iter().zip(&batches).zip(&distances) {
-            let figures = Figures::of(batch, distances, &models, &step, &self.units().live)?;
-            let kept = batch.kept_rows();
-            let judge = |h: &memorisation::HeldOut| h.judge(&pairs(self.units(), &kept), &streams);
-            let coverage = covered(&kept)?;
-            if references.is_some() && coverage.is_none() {
-                notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", kept.len()));
-            }
-            bounds_of_y.push(AtBound {
-                y_max: decimal(y),
-                lost: batch.lost,
-                coverage,
-                rejected: batch.rejected(),
-                memorisation: held_out.as_ref().map(judge).transpose()?.flatten(),
-                kept: figures.reliability(batch, true),
-                outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
-            });
-        }
+        let measured = Measured {
+            models: &models,
+            references: references.as_ref(),
+            held_out: held_out.as_ref(),
+            step: &step,
+            streams: &streams,
+        };
+        let bounds = grid.iter().zip(&batches).zip(&distances);
+        let bounds = bounds.map(|((&y, batch), distances)| self.at_bound(y, batch, distances, &measured, &mut notes));
+        let bounds_of_y = bounds.collect::<Result<Vec<_>>>()?;
         begin_step(PARTS[3]);
         let theorem = sources.as_ref().map(|s| self.theorem(s, own, &models, &streams)).transpose()?;
         if theorem.is_none() {
@@ -183,48 +126,32 @@ impl Work<'_> {
         })
     }
 
-    /// A sample of the source rows in the order of their distances to the target (Eq. 9), and of the nearest share.
-    fn sources(&self, streams: &Streams) -> Result<Option<Sources>> {
-        let Subject { inputs, config, .. } = *self.subject;
-        let Some(source) = &inputs.source else { return Ok(None) };
-        let (all, distances) = (&source.rows, distances(inputs, SourceRows::Nearest, self.root)?);
-        let mut order: Vec<usize> = (0..all.len()).collect();
-        order.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]).then(a.cmp(&b)));
-        let pick = |from: &[usize], name: &str| {
-            let places = choose(&mut streams.stream(name), from.len(), SOURCES.min(all.len() / 2).max(1));
-            places.into_iter().map(|i| from[i]).collect::<Vec<_>>()
-        };
-        let share =
-            if config.mixture.lambda > 0.0 && config.mixture.lambda < 1.0 { config.mixture.lambda } else { NEAREST };
-        let near = ((share * all.len() as f64).round() as usize).clamp(1, all.len());
-        let measured = pick(&order, "sources");
-        Ok(Some(Sources {
-            sorted: all.select(&measured),
-            episodes: episodes_of(all, &measured),
-            nearest: all.select(&pick(&order[..near], "nearest")),
-            others: all.select(&others(all.len(), &measured)),
-        }))
-    }
-
-    /// As many rows as there are of each kind, `kept` of them generated; None where that is too few for neighbourhoods.
-    fn references(&self, streams: &Streams, sources: Option<&Sources>, kept: usize) -> Result<Option<References>> {
-        let target = &self.subject.inputs.target.rows;
-        let (first, second, by_episode) = halves(target, streams);
-        let enough = first.len().min(second.len()).min(kept).min(sources.map_or(usize::MAX, |s| s.sorted.len()));
-        let rows = REFERENCE.min(enough);
-        if rows <= coverage::NEIGHBOUR {
-            return Ok(None);
+    /// The figures under one label bound.
+    fn at_bound(
+        &self,
+        y: f32,
+        batch: &Batch,
+        distances: &[f32],
+        measured: &Measured,
+        notes: &mut Vec<String>,
+    ) -> Result<AtBound> {
+        let Measured { models, references, held_out, step, streams } = *measured;
+        let figures = Figures::of(batch, distances, models, step, &self.units().live)?;
+        let kept = batch.kept_rows();
+        let judge = |h: &memorisation::HeldOut| h.judge(&pairs(self.units(), &kept), streams);
+        let coverage = references.map_or(Ok(None), |r| r.covered_by(&kept, self.units(), streams))?;
+        if references.is_some() && coverage.is_none() {
+            notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", kept.len()));
         }
-        let reference =
-            |t: &Transitions| coverage::Reference::new(self.units().states(&t.observations), self.units().live.len());
-        let source = sources.map(|s| reference(&few(&s.sorted, rows, streams, "reference/source"))).transpose()?;
-        Ok(Some(References {
-            rows,
-            target: reference(&few(&target.select(&first), rows, streams, "reference/target"))?,
-            source,
-            other_target: target.select(&second),
-            by_episode,
-        }))
+        Ok(AtBound {
+            y_max: decimal(y),
+            lost: batch.lost,
+            coverage,
+            rejected: batch.rejected(),
+            memorisation: held_out.map(judge).transpose()?.flatten(),
+            kept: figures.reliability(batch, true),
+            outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
+        })
     }
 
     /// For every batch, the distance of every row's state to the nearest one of target and source.
@@ -413,46 +340,6 @@ impl Work<'_> {
     }
 }
 
-/// What is said of rows that are no part of a figure, and of bounds that there are none of.
-fn left_out(own: &Batch, theorem: Option<&Bounds>, simulator: bool) -> Vec<String> {
-    let mut notes = Vec::new();
-    let lost = own.simulated.as_ref().map_or(0, |s| (0..own.len()).filter(|&i| !s.held(i)).count());
-    if lost > 0 {
-        notes.push(format!(
-            "The simulator's physics blew up in {lost} generated rows at the run's own y_max; medians and percentiles leave them out."
-        ));
-    }
-    let Some(theorem) = theorem else { return notes };
-    let Bounds { value, value_alone, transition, transition_alone, .. } = theorem;
-    for (what, curve, expected) in [
-        ("on values by the simulator", value, simulator),
-        ("on values by the data alone", value_alone, true),
-        ("on transitions by the simulator", transition, simulator),
-        ("on transitions by the data alone", transition_alone, true),
-    ] {
-        match curve {
-            None if expected => notes.push(format!(
-                "Theorem 1's bound {what} is missing: the discrepancy is a finite number in no source row, or in no generated one; \
-                 a model has diverged."
-            )),
-            Some(c) if c.lost != (0, 0) => notes.push(format!(
-                "Theorem 1's bound {what} leaves out {} source and {} generated rows, whose discrepancy is no finite number.",
-                c.lost.0, c.lost.1
-            )),
-            _ => (),
-        }
-    }
-    let single = |c: &Curve| c.generated_error.is_none() || c.errors[0].iter().any(Option::is_none);
-    if value_alone.as_ref().is_some_and(single) {
-        notes.push(
-            "The source's nearest rows, or the generated ones, are of a single trajectory, which says nothing of others: λ = 0 cannot be \
-             told from every other λ."
-                .into(),
-        );
-    }
-    notes
-}
-
 /// One number per row of a batch, for every figure that can be measured.
 #[derive(Default)]
 struct Figures {
@@ -501,41 +388,6 @@ impl Figures {
     }
 }
 
-/// Two halves of the rows in whole episodes, drawn at random, and whether that could be: where one would have less than a third of the rows,
-/// rows are drawn instead.
-fn halves(t: &Transitions, streams: &Streams) -> (Vec<usize>, Vec<usize>, bool) {
-    let mut episodes = t.episodes();
-    episodes.shuffle(&mut streams.stream("halves"));
-    // The longest first: each goes where there are fewer rows.
-    episodes.sort_by_key(|e| std::cmp::Reverse(e.end - e.start));
-    let (mut first, mut second) = (Vec::new(), Vec::new());
-    for e in episodes {
-        let half = if second.len() < first.len() { &mut second } else { &mut first };
-        half.extend(e.start..e.end);
-    }
-    if 3 * second.len().min(first.len()) < t.len() {
-        let chosen = choose(&mut streams.stream("halves/rows"), t.len(), t.len() / 2);
-        let second = others(t.len(), &chosen);
-        return (chosen, second, false);
-    }
-    first.sort_unstable();
-    second.sort_unstable();
-    (first, second, true)
-}
-
-/// The episode of each of the rows at `places`.
-fn episodes_of(t: &Transitions, places: &[usize]) -> Vec<usize> {
-    let all: Vec<usize> = t.episodes().iter().enumerate().flat_map(|(k, e)| vec![k; e.end - e.start]).collect();
-    places.iter().map(|&i| all[i]).collect()
-}
-
-/// Which of 0 .. `count` are not among `places`.
-fn others(count: usize, places: &[usize]) -> Vec<usize> {
-    let mut free = vec![true; count];
-    places.iter().for_each(|&i| free[i] = false);
-    (0..count).filter(|&i| free[i]).collect()
-}
-
 /// (s, s') of live dimensions in units of the states, `[N, 2 d]`.
 pub(crate) fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
     let d = units.live.len();
@@ -546,69 +398,4 @@ pub(crate) fn pairs(units: &Units, t: &Transitions) -> Vec<f32> {
 /// As it is written: .1 and not .10000000149.
 fn decimal(y: f32) -> f64 {
     y.to_string().parse().unwrap_or(f64::from(y))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::diagnosis::models::tests::log;
-
-    #[test]
-    fn rows_know_their_episode() {
-        assert_eq!(episodes_of(&log(&[2, 3, 1]), &[5, 0, 3, 1, 4, 2]), [2, 0, 1, 0, 1, 1]);
-    }
-
-    /// Every figure that is missing has a note.
-    #[test]
-    fn what_is_left_out_is_told() {
-        let t = log(&[1, 1]);
-        let held = |rewards: Vec<f32>| tce_sim::Simulated { rewards, ..Default::default() };
-        let batch =
-            |simulated| Batch { rows: t.clone(), keep: vec![true; 2], labels: vec![0.0; 2], simulated, lost: 0 };
-        let curve = |sources: &[f64]| Curve::of(&Rated::certain(sources.to_vec()), &Rated::certain(vec![1.0, 2.0]));
-        let rows: Vec<f64> = (0..1000).map(f64::from).collect();
-        let with = |value: Option<Curve>, value_alone: Option<Curve>| Bounds {
-            discount: 0.9,
-            r_max: 1.0,
-            transition: curve(&rows),
-            value,
-            transition_alone: curve(&rows),
-            value_alone,
-            held_out: None,
-        };
-        let notes = |b: &Batch, t: &Bounds| left_out(b, Some(t), true).join("\n");
-        let whole = with(curve(&rows), curve(&rows));
-        assert_eq!(notes(&batch(Some(held(vec![1.0, 2.0]))), &whole), "");
-        assert!(notes(&batch(Some(held(vec![1.0, f32::NAN]))), &whole).contains("blew up in 1 generated rows"));
-        let none = batch(None);
-        assert!(
-            notes(&none, &with(curve(&[f64::NAN]), curve(&rows))).contains("on values by the simulator is missing")
-        );
-        assert!(!left_out(&none, Some(&with(None, curve(&rows))), false).join("").contains("missing"));
-        let one = notes(&none, &with(curve(&rows), curve(&[&rows[..], &[f64::INFINITY]].concat())));
-        assert!(one.contains("on values by the data alone leaves out 1 source and 0 generated rows"), "{one}");
-        assert!(notes(&none, &with(curve(&rows), curve(&rows[..50]))).contains("are of a single trajectory"));
-    }
-
-    #[test]
-    fn halves_are_whole_episodes_where_they_are_even_enough() {
-        for (lengths, whole) in [
-            (vec![10; 5], true),
-            (vec![10, 10], true),
-            (vec![30, 10, 10, 10], true),
-            (vec![50], false),
-            (vec![50, 5], false),
-            (vec![997, 1, 1, 1], false),
-        ] {
-            let t = log(&lengths);
-            let (first, second, by_episode) = halves(&t, &Streams::new(1));
-            assert_eq!(by_episode, whole, "{lengths:?}");
-            let mut all = [first.clone(), second.clone()].concat();
-            all.sort_unstable();
-            assert_eq!(all, (0..t.len()).collect::<Vec<_>>(), "{lengths:?}: every row once");
-            assert!(3 * first.len().min(second.len()) >= t.len(), "{lengths:?}: {} and {}", first.len(), second.len());
-            let split = |e: &tce_data::Episode| first.contains(&e.start) != first.contains(&(e.end - 1));
-            assert!(!whole || !t.episodes().iter().any(split), "{lengths:?}");
-        }
-    }
 }

@@ -35,6 +35,8 @@ pub mod generator;
 pub mod implied;
 pub(crate) mod measures;
 mod models;
+mod notes;
+mod references;
 mod rows;
 mod work;
 
