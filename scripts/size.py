@@ -15,7 +15,17 @@ ROOT = Path(__file__).resolve().parent.parent
 LINES, FUNCTION, PARAMETERS = 500, 80, 7
 
 # What stays as it is, and why. A key is what the script prints.
-ALLOWED = {}
+KERNEL = "a kernel: its arguments are strides and pointers, its body one loop nest"
+ALLOWED = {
+    "crates/tce-nn/src/gemm/kernel.rs: fn drive": KERNEL,
+    "crates/tce-nn/src/gemm/kernel.rs: fn tile()": KERNEL,
+    "crates/tce-nn/src/gemm/kernel.rs: fn tiles()": KERNEL,
+    "crates/tce-nn/src/kernels.rs: fn backward()": KERNEL,
+    "crates/tce-nn/src/stack.rs: fn block()": KERNEL,
+    "crates/tce-zoo/src/sac_training.rs": "one training with its ledger; to be cut where its checkpoints become those of other trainings",
+    "crates/tce-zoo/src/sac_training.rs: fn open": "as the file",
+    "crates/tce/src/commands/train_sac.rs: fn run": "as sac_training.rs, whose settings it fills",
+}
 
 
 def main():

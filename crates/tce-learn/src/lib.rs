@@ -18,6 +18,7 @@
 //! | one-step predictions in both domains, to filter rows and to try policies by | [`dynamics`] |
 //! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
+mod about;
 pub mod algorithms;
 pub mod core;
 mod error;
@@ -36,6 +37,7 @@ pub use crate::models::{critic, cvae, dynamics, labels, pair_model, transformer,
 pub use crate::policies::{actor, import};
 use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
+pub use about::{About, OtherRows};
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
 pub use blocks::map_rows;

@@ -1,7 +1,7 @@
 //! The two data sets of a run: found, loaded, and refused together if they do not fit.
 
 use std::borrow::Cow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use tce_data::{
@@ -10,7 +10,7 @@ use tce_data::{
 };
 use tce_sim::EPISODE_LIMIT;
 
-use crate::config::{Algorithm, Config, LearnerConfig, TargetConfig, Trajectories};
+use crate::config::{Config, LearnerConfig, TargetConfig, Trajectories};
 use crate::error::{Error, Result};
 use crate::own::{Own, range_of};
 pub use crate::tables::{Behaviour, Table};
@@ -192,8 +192,8 @@ impl Inputs {
     /// Names the setting.
     pub fn ensure_episodes(&self, learner: &LearnerConfig) -> Result<()> {
         let needs = match learner.algorithm {
-            Algorithm::MetaDt => "meta-dt learns sequences",
-            _ if learner.top < 1.0 => "learner.top chooses by the returns of episodes",
+            algorithm if algorithm.method().episodes => format!("{} learns sequences", algorithm.method().name),
+            _ if learner.top < 1.0 => "learner.top chooses by the returns of episodes".to_owned(),
             _ => return Ok(()),
         };
         match self.target.has_episodes() {
@@ -270,6 +270,12 @@ impl Inputs {
             );
         }
         Ok(())
+    }
+
+    /// The files of the target's and the source's rows, if there is a source.
+    pub fn files(&self) -> Vec<PathBuf> {
+        let tables = std::iter::once(&self.target).chain(&self.source);
+        tables.map(|t| std::path::absolute(&t.file).unwrap_or_else(|_| t.file.clone())).collect()
     }
 
     /// What identifies these inputs; with `source` left out for stages that do not look at it.

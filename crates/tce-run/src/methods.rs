@@ -2,37 +2,17 @@
 
 use std::sync::Arc;
 
-use serde::Serialize;
 use tce_augment::single_stage::{enough_to_score, score_streams};
 use tce_data::{Rows, Transitions, TransportOptions, density_scores, transport_costs};
+use tce_learn::algorithms::{bc, bosa, dara, dmc, igdf, iql, meta_dt, otdf, rebrac, srpo, td3_bc};
 use tce_learn::{
-    Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, MetaDt, Otdf, Place, PolicyLearner, Rebrac, Regulariser, Srpo,
-    Td3Bc,
+    About, Bc, Bosa, Buffer, Dara, Dmc, Igdf, Iql, IqlConfig, MetaDt, Otdf, Place, PolicyLearner, Rebrac, Regulariser,
+    Srpo, Td3Bc,
 };
 use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::error::{Error, Result};
-
-/// [`Method::needs`] of learners that compare the domains.
-pub const SOURCE_ROWS: &str = "source rows";
-
-/// What `tce learn --list` prints of a learner.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub struct Method {
-    /// Its name on the command line and in `learner.algorithm`.
-    pub name: &'static str,
-    /// One line.
-    pub description: &'static str,
-    /// Whose it is.
-    pub reference: &'static str,
-    /// How `mode = "published"` differs; none where there is one form.
-    pub published: Option<&'static str>,
-    /// The table of its keys.
-    pub table: &'static str,
-    /// What the rows besides the target's must have.
-    pub needs: &'static str,
-}
 
 impl Algorithm {
     /// All of them, in the order of the list.
@@ -52,96 +32,24 @@ impl Algorithm {
 
     /// Whether it looks at s' of terminal rows: it models the dynamics, or compares transitions of two domains.
     pub fn looks_at_successors(self) -> bool {
-        !matches!(self, Algorithm::Bc | Algorithm::Iql | Algorithm::Td3Bc | Algorithm::Rebrac)
+        self.method().successors
     }
 
     /// What it is.
-    pub fn method(self) -> Method {
-        let any = "any rows, or none";
-        let source = SOURCE_ROWS;
-        let (name, description, reference, published, table, needs) = match self {
-            Algorithm::Bc => (
-                "bc",
-                "behaviour cloning; of the best trajectories with learner.top",
-                "Pomerleau 1989",
-                None,
-                "bc",
-                any,
-            ),
-            Algorithm::Iql => {
-                ("iql", "implicit Q-learning, TCE's learner", "Kostrikov et al. 2022; TCE, B.2", None, "iql", any)
-            }
-            Algorithm::Td3Bc => {
-                ("td3-bc", "TD3 with a behaviour-cloning term", "Fujimoto and Gu 2021", None, "td3_bc", any)
-            }
-            Algorithm::Rebrac => (
-                "rebrac",
-                "TD3+BC with a penalty in the critics too, and normalised critics",
-                "Tarasov et al. 2023",
-                None,
-                "rebrac",
-                any,
-            ),
-            Algorithm::Dara => (
-                "dara",
-                "IQL; source rewards lowered where two classifiers tell the domains apart",
-                "Liu et al. 2022; ODRL",
-                Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
-                "dara",
-                source,
-            ),
-            Algorithm::Bosa => (
-                "bosa",
-                "deterministic actor-critic on the support of dynamics and behaviour models",
-                "Liu et al. 2024; ODRL",
-                Some("critics bootstrap at terminal rows and nowhere else"),
-                "bosa",
-                source,
-            ),
-            Algorithm::Srpo => (
-                "srpo",
-                "IQL; rewards raised where the state looks like one of high value",
-                "Xue et al. 2023; IGDF's repository",
-                Some("the discriminator's logit is clamped where its odds are meant"),
-                "srpo",
-                any,
-            ),
-            Algorithm::Igdf => (
-                "igdf",
-                "IQL; source rows chosen by a contrastive model of the target's dynamics",
-                "Wen et al. 2024; ODRL",
-                Some(
-                    "the contrastive model is never trained; with code = \"authors\", no row weighs more than another",
-                ),
-                "igdf",
-                source,
-            ),
-            Algorithm::Otdf => (
-                "otdf",
-                "IQL; source rows chosen by optimal transport, policy held to the target's behaviour",
-                "Lyu et al. 2025",
-                Some("advantages have no effect on which action is cloned (a broadcast)"),
-                "otdf",
-                source,
-            ),
-            Algorithm::Dmc => (
-                "dmc",
-                "OTDF's policy; source and guided generated rows chosen and weighed by nearest neighbours",
-                "DmC, ECAI 2025",
-                Some("OTDF's broadcast, and a behaviour model that is never trained"),
-                "dmc",
-                "source rows, or rows of mixture.generated = \"dmc\"",
-            ),
-            Algorithm::MetaDt => (
-                "meta-dt",
-                "a decision transformer on contexts of a world model, zero-shot",
-                "Meta-DT 2024",
-                None,
-                "meta_dt",
-                any,
-            ),
-        };
-        Method { name, description, reference, published, table, needs }
+    pub fn method(self) -> About {
+        match self {
+            Algorithm::Bc => bc::ABOUT,
+            Algorithm::Iql => iql::ABOUT,
+            Algorithm::Td3Bc => td3_bc::ABOUT,
+            Algorithm::Rebrac => rebrac::ABOUT,
+            Algorithm::Dara => dara::ABOUT,
+            Algorithm::Bosa => bosa::ABOUT,
+            Algorithm::Srpo => srpo::ABOUT,
+            Algorithm::Igdf => igdf::ABOUT,
+            Algorithm::Otdf => otdf::ABOUT,
+            Algorithm::Dmc => dmc::ABOUT,
+            Algorithm::MetaDt => meta_dt::ABOUT,
+        }
     }
 }
 

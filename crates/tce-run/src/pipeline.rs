@@ -74,6 +74,25 @@ struct RunSpec<'a> {
     joint: Option<serde_json::Value>,
 }
 
+impl<'a> RunSpec<'a> {
+    fn new(inputs: &Inputs, config: &'a Config, seeds: &'a [u64]) -> Self {
+        let two_stages = config.mixture.generated == GeneratedRows::Tce;
+        let relabelled = config.mixture.source == SourceRows::Relabelled;
+        Self {
+            inputs: inputs.spec_imitated(config.needs_source(), &config.target),
+            seeds,
+            mixture: &config.mixture,
+            learner: config.learner.used(),
+            evaluation: &config.evaluation,
+            generator: two_stages.then_some(&config.generator),
+            filter: two_stages.then_some(&config.filter),
+            labels: (two_stages || relabelled).then_some(&config.labels),
+            dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
+            joint: used_of_single_stage(&config.joint, config.mixture.generated, config.learner.algorithm),
+        }
+    }
+}
+
 /// What a run says about its policies: `result.json`.
 #[derive(Serialize)]
 struct Outcome<'a> {
@@ -133,20 +152,8 @@ pub fn run(
 ) -> Result<Summary> {
     inputs.ensure_episodes(&config.learner)?;
     let generated = config.mixture.generated != GeneratedRows::None;
-    let two_stages = config.mixture.generated == GeneratedRows::Tce;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
-    let spec = RunSpec {
-        inputs: inputs.spec_imitated(config.needs_source(), &config.target),
-        seeds,
-        mixture: &config.mixture,
-        learner: config.learner.used(),
-        evaluation: &config.evaluation,
-        generator: two_stages.then_some(&config.generator),
-        filter: two_stages.then_some(&config.filter),
-        labels: (two_stages || relabelled).then_some(&config.labels),
-        dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
-        joint: used_of_single_stage(&config.joint, config.mixture.generated, config.learner.algorithm),
-    };
+    let spec = RunSpec::new(inputs, config, seeds);
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
     if let Some(summary) = stage.summary::<Summary>()? {
         tce_base::note!("{name}: done before, in {}", stage.directory().display());
@@ -158,14 +165,10 @@ pub fn run(
     write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
     let mut files = vec!["config.toml".to_owned()];
 
-    let mut reports = Vec::new();
-    let mut tables = None;
+    let (mut reports, mut tables) = (Vec::new(), None);
     if generated {
         let expansion = expand(inputs, config, seeds, root, device)?;
-        for report in &expansion.reports {
-            attempt.link(&expansion.stage.file(&report.file), &report.file)?;
-            files.push(report.file.clone());
-        }
+        files.extend(expansion.link_into(&attempt)?);
         reports = expansion.reports;
         let scored = expansion.tables.into_iter().zip(expansion.scores);
         tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
@@ -178,31 +181,7 @@ pub fn run(
     if let Some(choice) = inputs.choice(&config.target) {
         tce_base::note!("{name}: {}", choice.reason);
     }
-    // Who models the dynamics has no use for a terminal row without a successor.
-    let target = match config.learner.algorithm.looks_at_successors() {
-        true => inputs.imitated(&config.target),
-        false => inputs.learned_from(&config.target),
-    };
-    let target = Arc::new(target.into_owned());
-    let mut trajectories = vec![target.clone()];
-    if let (SourceRows::All, Some(extra)) = (config.mixture.source, &extra) {
-        // Generated rows among them are no trajectories.
-        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
-    }
-    let scores = |rows: &ScoredRows| match &rows.scores {
-        Some(scores) => Ok(Some(scores.clone())),
-        // Generated rows among them are each seed's own.
-        None => row_scores(config, &target, &rows.rows),
-    };
-    let scores = extra.iter().flatten().map(scores).collect::<Result<Vec<_>>>()?;
-    let data = |(m, &seed): (usize, &u64)| MemberData {
-        seed,
-        target: target.clone(),
-        extra: extra.as_ref().map(|e| e[m].rows.clone()),
-        row_scores: scores.get(m).cloned().flatten(),
-        trajectories: trajectories.clone(),
-    };
-    let data: Vec<_> = seeds.iter().enumerate().map(data).collect();
+    let data = members(inputs, config, extra.as_deref(), seeds)?;
     let arena = match (inputs.agent, inputs.shift) {
         (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
@@ -226,10 +205,7 @@ pub fn run(
         generated: reports,
         seconds: started.elapsed().as_secs_f64(),
         directory: stage.directory().to_owned(),
-        data: std::iter::once(&inputs.target)
-            .chain(&inputs.source)
-            .map(|t| std::path::absolute(&t.file).unwrap_or_else(|_| t.file.clone()))
-            .collect(),
+        data: inputs.files(),
     };
     // Without times, so that two copies of a run have the same bytes.
     let result = "result.json".to_owned();
@@ -240,6 +216,36 @@ pub fn run(
     files.push(result);
     attempt.finish(&files, &summary)?;
     Ok(summary)
+}
+
+/// What every member learns from: the target's rows, and its `extra` ones.
+fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
+    // Who models the dynamics has no use for a terminal row without a successor.
+    let target = match config.learner.algorithm.looks_at_successors() {
+        true => inputs.imitated(&config.target),
+        false => inputs.learned_from(&config.target),
+    };
+    let target = Arc::new(target.into_owned());
+    let mut trajectories = vec![target.clone()];
+    if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
+        // Generated rows among them are no trajectories.
+        let generated = config.mixture.generated != GeneratedRows::None;
+        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
+    }
+    let scores = |rows: &ScoredRows| match &rows.scores {
+        Some(scores) => Ok(Some(scores.clone())),
+        // Generated rows among them are each seed's own.
+        None => row_scores(config, &target, &rows.rows),
+    };
+    let scores = extra.iter().copied().flatten().map(scores).collect::<Result<Vec<_>>>()?;
+    let data = |(m, &seed): (usize, &u64)| MemberData {
+        seed,
+        target: target.clone(),
+        extra: extra.map(|e| e[m].rows.clone()),
+        row_scores: scores.get(m).cloned().flatten(),
+        trajectories: trajectories.clone(),
+    };
+    Ok(seeds.iter().enumerate().map(data).collect())
 }
 
 /// `n` seeds from `first` on.

@@ -203,16 +203,27 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
         let doubts = doubts(table, &out);
         out.warnings.extend(doubts);
     }
-    if !breaks.is_empty() && joined_timeouts.len() * 2 > marks.len() {
+    if !breaks.is_empty() {
+        reconcile(&mut out, &marks, &joined_timeouts, &breaks);
+    }
+    breaks.iter().for_each(|&i| out.timeouts[i] = true);
+    out.warnings.extend(displaced_terminals(table, joined));
+    out.warnings.extend(held_terminals(table, joined));
+    out
+}
+
+/// Follows the `breaks` between states where the `marks` of time-outs contradict them. `joined_timeouts` are marks that the next row continues.
+fn reconcile(out: &mut Resolved, marks: &[usize], joined_timeouts: &[usize], breaks: &[usize]) {
+    if joined_timeouts.len() * 2 > marks.len() {
         joined_timeouts.iter().for_each(|&i| out.timeouts[i] = false);
         out.ends = EpisodeEnds::Continuity;
         out.warnings.push(format!(
             "`timeouts` contradicts the states: it marks {}, which the next row continues, and not {}, where s' is not the next row's \
              state. Episodes end where the states say; correct `timeouts` (is it shifted?)",
-            tell(&joined_timeouts),
-            tell(&breaks)
+            tell(joined_timeouts),
+            tell(breaks)
         ));
-    } else if !breaks.is_empty() {
+    } else {
         // A mark one row from where an episode visibly ends is that end's.
         let beside = |i: &&usize| {
             breaks.binary_search(&(**i + 1)).is_ok() || **i > 0 && breaks.binary_search(&(**i - 1)).is_ok()
@@ -230,13 +241,9 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
         }
         out.warnings.push(format!(
             "`timeouts` does not mark {}, where s' is not the next row's state: episodes end there, too",
-            tell(&breaks)
+            tell(breaks)
         ));
     }
-    breaks.iter().for_each(|&i| out.timeouts[i] = true);
-    out.warnings.extend(displaced_terminals(table, joined));
-    out.warnings.extend(held_terminals(table, joined));
-    out
 }
 
 /// Told where a terminal row is followed by its own successor, which is terminal as well.

@@ -26,11 +26,24 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 
+use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Learner, Meter};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "bc",
+    description: "behaviour cloning; of the best trajectories with learner.top",
+    reference: "Pomerleau 1989",
+    published: None,
+    table: "bc",
+    needs: OtherRows::Any,
+    successors: false,
+    episodes: false,
+};
 
 /// The configuration of [`Bc`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

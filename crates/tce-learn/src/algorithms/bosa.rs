@@ -33,6 +33,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
 
+use crate::about::{About, OtherRows};
 use crate::actor::ActorConfig;
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
@@ -44,6 +45,18 @@ use crate::mode::Mode;
 use crate::selection::need_others;
 use crate::td3_bc::normalised_value;
 use crate::training::{Learner, Meter, Place, prepare};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "bosa",
+    description: "deterministic actor-critic on the support of dynamics and behaviour models",
+    reference: "Liu et al. 2024; ODRL",
+    published: Some("critics bootstrap at terminal rows and nowhere else"),
+    table: "bosa",
+    needs: OtherRows::Source,
+    successors: true,
+    episodes: false,
+};
 
 /// The configuration of [`Bosa`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

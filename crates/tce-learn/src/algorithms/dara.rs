@@ -26,6 +26,7 @@ use serde::{Deserialize, Serialize};
 use tce_nn::burn::tensor::activation::{log_softmax, softmax};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
+use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::error::{LearnError, within};
@@ -36,6 +37,18 @@ use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::need_others;
 use crate::training::{Meter, member_noise};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "dara",
+    description: "IQL; source rewards lowered where two classifiers tell the domains apart",
+    reference: "Liu et al. 2022; ODRL",
+    published: Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
+    table: "dara",
+    needs: OtherRows::Source,
+    successors: true,
+    episodes: false,
+};
 
 /// Added to a probability before its logarithm (ODRL).
 const TINY: f64 = 1e-10;

@@ -31,6 +31,7 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
+use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
@@ -40,6 +41,18 @@ use crate::otdf::otdf_policy;
 use crate::regulariser::{Regulariser, RegulariserConfig};
 use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "dmc",
+    description: "OTDF's policy; source and guided generated rows chosen and weighed by nearest neighbours",
+    reference: "DmC, ECAI 2025",
+    published: Some("OTDF's broadcast, and a behaviour model that is never trained"),
+    table: "dmc",
+    needs: OtherRows::Scored,
+    successors: true,
+    episodes: false,
+};
 
 /// The configuration of [`Dmc`], besides [`IqlConfig`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

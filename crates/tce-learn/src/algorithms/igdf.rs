@@ -27,6 +27,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
+use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::error::{LearnError, within};
@@ -37,6 +38,18 @@ use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{Selected, host_from, need_others};
 use crate::training::{Learner, Meter, Place, prepare};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "igdf",
+    description: "IQL; source rows chosen by a contrastive model of the target's dynamics",
+    reference: "Wen et al. 2024; ODRL",
+    published: Some("the contrastive model is never trained; with code = \"authors\", no row weighs more than another"),
+    table: "igdf",
+    needs: OtherRows::Source,
+    successors: true,
+    episodes: false,
+};
 
 /// Whose code [`Mode::Published`] follows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -35,6 +35,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host};
 
+use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig, PolicyForm, PolicyOutput};
 use crate::buffer::{Buffer, Minibatch, RewardScale};
 use crate::critic::{Twins, state_action};
@@ -43,6 +44,18 @@ use crate::losses::{AdvantageScale, AdvantageWeights, advantage_weights, expecti
 use crate::policy::{Policy, PolicyLearner};
 use crate::regulariser::{Regulariser, RegulariserKind};
 use crate::training::{Learner, Meter};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "iql",
+    description: "implicit Q-learning, TCE's learner",
+    reference: "Kostrikov et al. 2022; TCE, B.2",
+    published: None,
+    table: "iql",
+    needs: OtherRows::Any,
+    successors: false,
+    episodes: false,
+};
 
 /// A weight below this does not move a policy.
 const DEAD_WEIGHT: f32 = 0.01;
@@ -215,7 +228,7 @@ impl Iql {
                 meter.record("value_magnitude", &v.inner().abs());
                 value_step(config, value, difference, batch, meter)
             },
-            || policy_step(config, actor, regulariser, output, batch, u, step, &mut policy_meter),
+            || policy_step(config, (actor, regulariser), (output, u), batch, step, &mut policy_meter),
         );
         meter.join(policy_meter);
         let loss = critics.step(sa, y, critic_weights, config.critic_lr, config.polyak);
@@ -239,15 +252,12 @@ fn value_step(
     batch.r.clone() + batch.not_done.clone() * next * config.discount
 }
 
-/// A step down L_π.
-#[allow(clippy::too_many_arguments)]
+/// A step down L_π, from the policy's output and the advantages u at the rows of `batch`.
 fn policy_step(
     c: &IqlConfig,
-    actor: &mut Actor,
-    regulariser: &Regulariser,
-    output: PolicyOutput,
+    (actor, regulariser): (&mut Actor, &Regulariser),
+    (output, u): (PolicyOutput, Tensor<3>),
     batch: &Minibatch,
-    u: Tensor<3>,
     step: u64,
     meter: &mut Meter,
 ) {

@@ -34,6 +34,7 @@ use tce_base::Streams;
 use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{AdamConfig, Device, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
+use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::contexts::{Contexts, Of};
 use crate::error::{LearnError, within};
@@ -44,6 +45,18 @@ use crate::sequences::Segments;
 use crate::training::{Learner, Meter, Place, prepare};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
 use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "meta-dt",
+    description: "a decision transformer on contexts of a world model, zero-shot",
+    reference: "Meta-DT 2024",
+    published: None,
+    table: "meta_dt",
+    needs: OtherRows::Any,
+    successors: true,
+    episodes: true,
+};
 
 /// The configuration of [`MetaDt`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -29,6 +29,7 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
+use crate::about::{About, OtherRows};
 use crate::actor::ActionReduction;
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
@@ -38,6 +39,18 @@ use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::{Regulariser, RegulariserKind};
 use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "otdf",
+    description: "IQL; source rows chosen by optimal transport, policy held to the target's behaviour",
+    reference: "Lyu et al. 2025",
+    published: Some("advantages have no effect on which action is cloned (a broadcast)"),
+    table: "otdf",
+    needs: OtherRows::Source,
+    successors: true,
+    episodes: false,
+};
 
 /// The configuration of [`Otdf`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -22,6 +22,7 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, MlpConfig};
 
+use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
@@ -29,6 +30,18 @@ use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::td3_bc::normalised_value;
 use crate::training::Meter;
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "rebrac",
+    description: "TD3+BC with a penalty in the critics too, and normalised critics",
+    reference: "Tarasov et al. 2023",
+    published: None,
+    table: "rebrac",
+    needs: OtherRows::Any,
+    successors: false,
+    episodes: false,
+};
 
 /// The configuration of [`Rebrac`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -26,6 +26,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
+use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
@@ -35,6 +36,18 @@ use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{best_others, kept_rows};
 use crate::training::Meter;
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "srpo",
+    description: "IQL; rewards raised where the state looks like one of high value",
+    reference: "Xue et al. 2023; IGDF's repository",
+    published: Some("the discriminator's logit is clamped where its odds are meant"),
+    table: "srpo",
+    needs: OtherRows::Any,
+    successors: true,
+    episodes: false,
+};
 
 /// The configuration of [`Srpo`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -20,6 +20,7 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, MlpConfig, Tensor};
 
+use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
@@ -27,6 +28,18 @@ use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
 use crate::training::Meter;
+
+/// What it is.
+pub const ABOUT: About = About {
+    name: "td3-bc",
+    description: "TD3 with a behaviour-cloning term",
+    reference: "Fujimoto and Gu 2021",
+    published: None,
+    table: "td3_bc",
+    needs: OtherRows::Any,
+    successors: false,
+    episodes: false,
+};
 
 /// The configuration of [`Td3Bc`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

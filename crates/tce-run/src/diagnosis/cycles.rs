@@ -114,22 +114,33 @@ fn same(stage: &Stage, a: &str, b: &str) -> Result<bool> {
     Ok(sha256_file(&stage.file(a))? == sha256_file(&stage.file(b))?)
 }
 
+/// What is measured, and how much of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Asked {
+    /// Where the truth is simulated.
+    pub place: (Agent, Shift),
+    /// Of the training.
+    pub seed: u64,
+    /// Generated rows behind a figure.
+    pub rows: usize,
+    /// Episodes of the implied policy.
+    pub episodes: usize,
+}
+
 /// Measures every network that the generator's stage keeps of q_tran, with `rows` rows at ŷ = 0 and `episodes` episodes each. Networks
 /// and label models are trained now where their stages under `root` are not there. `said` hears of every network when it is measured.
 ///
 /// # Errors
 /// If a part of the work fails, or the user interrupts.
-#[allow(clippy::too_many_arguments)]
 pub fn cycles(
     inputs: &Inputs,
     config: &Config,
-    place: (Agent, Shift),
-    seed: u64,
-    (rows, episodes): (usize, usize),
+    asked: Asked,
     root: &Path,
     device: &Device,
     mut said: impl FnMut(&AtCycle),
 ) -> Result<Cycles> {
+    let Asked { place, seed, rows, episodes } = asked;
     let (mut generator, stage, trained) = networks(inputs, config, &[seed], root, device)?;
     let (models, ..) = label_models(inputs, &config.labels, &[seed], root, device)?;
     let target = &inputs.target.rows;

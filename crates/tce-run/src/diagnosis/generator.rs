@@ -99,51 +99,64 @@ pub fn step_std(target: &Transitions, live: &[usize]) -> Vec<f32> {
     Standardizer::fit_on(&[Rows::new(&steps, live.len())]).std
 }
 
-/// Measures one sampler of a trained generator (member 0) on `rows` rows.
-#[allow(clippy::too_many_arguments)]
-pub fn quality(
-    generator: &Generator,
-    models: &LabelModels,
-    config: &GeneratorConfig,
-    sampler: &Sampler,
-    finisher: &Finisher,
-    (training, held_out): (&Transitions, &Transitions),
-    (agent, shift): (Agent, Shift),
-    rows: usize,
-    seed: u64,
-) -> Result<Quality> {
-    let members = [Streams::new(seed)];
-    let units = &generator.units;
-    let d = units.live.len();
-    let started = std::time::Instant::now();
-    let draw = Draw::new(sampler, &members, training);
-    let states = generator.sample_states(rows, 0.0, &draw)?;
-    let seconds = started.elapsed().as_secs_f64();
-    let successors = generator.sample_successors(&states, &draw)?;
-    let scale = Standardizer::fit(&units.take(&training.observations), d);
-    let generated = scale.apply(&states);
-    let real = |t: &Transitions| scale.apply(&units.take(&t.observations));
-    let (training_states, held_out_states) = (real(training), real(held_out));
-    let sw = |other: &[f32]| sliced_wasserstein(&generated, other, d, PROJECTIONS, &members[0]);
-    let ratios = std_ratios(&generated, &training_states, d);
-    let finite: Vec<f64> = ratios.into_iter().filter(|r| r.is_finite()).collect();
+/// A trained generator (member 0), and what it is measured by.
+pub struct Tried<'a> {
+    /// The networks.
+    pub generator: &'a Generator,
+    /// Inverse dynamics and reward.
+    pub models: &'a LabelModels,
+    /// The networks' settings.
+    pub config: &'a GeneratorConfig,
+    /// The filter of expanded rows.
+    pub finisher: &'a Finisher<'a>,
+    /// Rows that the networks were trained on.
+    pub training: &'a Transitions,
+    /// Rows that they were not.
+    pub held_out: &'a Transitions,
+    /// Where the truth is simulated.
+    pub place: (Agent, Shift),
+}
 
-    let step = step_std(training, &units.live);
-    let pair = (units.put_back(&states), units.put_back(&successors));
-    let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-    let expanded_states = generator.sample_states(rows, config.y_max, &draw)?;
-    let expanded_successors = generator.sample_successors(&expanded_states, &draw)?;
-    let expanded = finisher.finish(&[(&expanded_states, &expanded_successors)])?.remove(0).transitions;
-    Ok(Quality {
-        evaluations: sampler.evaluations(),
-        sw_training: sw(&training_states),
-        sw_held_out: sw(&held_out_states),
-        std_ratio: finite.iter().sum::<f64>() / finite.len() as f64,
-        largest: generated.iter().fold(0.0f64, |m, &v| m.max(v.abs() as f64)),
-        consistency: consistency(agent, shift, &at_zero, &step, &units.live)?,
-        consistency_expanded: consistency(agent, shift, &expanded, &step, &units.live)?,
-        rows_per_second: rows as f64 / seconds,
-    })
+impl Tried<'_> {
+    /// Measures one sampler on `rows` rows.
+    ///
+    /// # Errors
+    /// If the sampler or the simulator fails.
+    pub fn quality(&self, sampler: &Sampler, rows: usize, seed: u64) -> Result<Quality> {
+        let Self { generator, models, config, finisher, training, held_out, place: (agent, shift) } = *self;
+        let members = [Streams::new(seed)];
+        let units = &generator.units;
+        let d = units.live.len();
+        let started = std::time::Instant::now();
+        let draw = Draw::new(sampler, &members, training);
+        let states = generator.sample_states(rows, 0.0, &draw)?;
+        let seconds = started.elapsed().as_secs_f64();
+        let successors = generator.sample_successors(&states, &draw)?;
+        let scale = Standardizer::fit(&units.take(&training.observations), d);
+        let generated = scale.apply(&states);
+        let real = |t: &Transitions| scale.apply(&units.take(&t.observations));
+        let (training_states, held_out_states) = (real(training), real(held_out));
+        let sw = |other: &[f32]| sliced_wasserstein(&generated, other, d, PROJECTIONS, &members[0]);
+        let ratios = std_ratios(&generated, &training_states, d);
+        let finite: Vec<f64> = ratios.into_iter().filter(|r| r.is_finite()).collect();
+
+        let step = step_std(training, &units.live);
+        let pair = (units.put_back(&states), units.put_back(&successors));
+        let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
+        let expanded_states = generator.sample_states(rows, config.y_max, &draw)?;
+        let expanded_successors = generator.sample_successors(&expanded_states, &draw)?;
+        let expanded = finisher.finish(&[(&expanded_states, &expanded_successors)])?.remove(0).transitions;
+        Ok(Quality {
+            evaluations: sampler.evaluations(),
+            sw_training: sw(&training_states),
+            sw_held_out: sw(&held_out_states),
+            std_ratio: finite.iter().sum::<f64>() / finite.len() as f64,
+            largest: generated.iter().fold(0.0f64, |m, &v| m.max(v.abs() as f64)),
+            consistency: consistency(agent, shift, &at_zero, &step, &units.live)?,
+            consistency_expanded: consistency(agent, shift, &expanded, &step, &units.live)?,
+            rows_per_second: rows as f64 / seconds,
+        })
+    }
 }
 
 #[cfg(test)]

@@ -49,10 +49,7 @@ impl Work<'_> {
         let streams = Streams::new(seed).child("diagnosis");
         let target = &inputs.target.rows;
         let mut notes = Vec::new();
-        let mut grid = options.y_max.clone();
-        grid.extend([0.0, config.generator.y_max]);
-        grid.sort_by(f32::total_cmp);
-        grid.dedup();
+        let grid = self.grid();
         begin_step(PARTS[0]);
         let batches = grid.iter().map(|&y| sampler.sample(options.rows, y, "figures")).collect::<Result<Vec<_>>>()?;
         let at = |y: f32| grid.iter().position(|g| *g == y).expect("on the grid");
@@ -93,13 +90,8 @@ impl Work<'_> {
         }
         notes.extend(left_out(own, theorem.as_ref(), self.simulator.is_some()));
         begin_step(PARTS[4]);
-        let mut states = Vec::new();
-        for y in [0.0, config.generator.y_max, *grid.last().expect("a grid")] {
-            if states.iter().all(|(other, _)| *other != decimal(y)) {
-                let picture = self.picture(&batches[at(y)], sources.as_ref(), &streams, false);
-                states.extend(picture.map(|p| (decimal(y), p)));
-            }
-        }
+        let pictured = [0.0, config.generator.y_max, *grid.last().expect("a grid")];
+        let states = self.pictures(&pictured.map(|y| (y, &batches[at(y)])), sources.as_ref(), &streams);
         Ok(Diagnosis {
             of: subject.of.clone(),
             task: subject.task,
@@ -124,6 +116,32 @@ impl Work<'_> {
             theorem,
             notes,
         })
+    }
+
+    /// The label bounds, ascending: those that were asked for, 0, and the run's own.
+    fn grid(&self) -> Vec<f32> {
+        let mut grid = self.options.y_max.clone();
+        grid.extend([0.0, self.subject.config.generator.y_max]);
+        grid.sort_by(f32::total_cmp);
+        grid.dedup();
+        grid
+    }
+
+    /// A picture of the states of each batch, by its bound; equal bounds once.
+    fn pictures(
+        &self,
+        batches: &[(f32, &Batch)],
+        sources: Option<&Sources>,
+        streams: &Streams,
+    ) -> Vec<(f64, Embedding)> {
+        let mut states: Vec<(f64, Embedding)> = Vec::new();
+        for (y, batch) in batches {
+            if states.iter().all(|(other, _)| *other != decimal(*y)) {
+                let picture = self.picture(batch, sources, streams, false);
+                states.extend(picture.map(|p| (decimal(*y), p)));
+            }
+        }
+        states
     }
 
     /// The figures under one label bound.

@@ -120,6 +120,21 @@ pub fn member_of(seeds: &[u64], seed: u64) -> Result<usize> {
     place.ok_or_else(|| Error::Usage(format!("--seed {seed}: the run's seeds are {seeds:?}; choose one of them")))
 }
 
+/// Refuses tables of which nothing can be told.
+fn ensure_enough(inputs: &Inputs) -> Result<()> {
+    let source = inputs.source.as_ref().map(|s| ("source", s));
+    for (name, table) in [("target", &inputs.target)].into_iter().chain(source) {
+        let found = table.rows.len();
+        if found < FEWEST {
+            return Err(Error::Usage(format!(
+                "{}: found {found} {name} rows, expected at least {FEWEST}: nothing can be said of generated rows beside so few",
+                table.file.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
 /// Diagnoses, or takes the result from its stage under `root`. Returns it with the stage's directory.
 ///
 /// # Errors
@@ -139,16 +154,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
     let Subject { inputs, config, seeds, seed, .. } = *subject;
     can_be_diagnosed(&subject.of, config)?;
     let member = member_of(seeds, seed)?;
-    let source = inputs.source.as_ref().map(|s| ("source", s));
-    for (name, table) in [("target", &inputs.target)].into_iter().chain(source) {
-        let found = table.rows.len();
-        if found < FEWEST {
-            return Err(Error::Usage(format!(
-                "{}: found {found} {name} rows, expected at least {FEWEST}: nothing can be said of generated rows beside so few",
-                table.file.display()
-            )));
-        }
-    }
+    ensure_enough(inputs)?;
     let used = serde_json::json!({
         "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
         "iql": config.learner.iql, "batch": config.learner.batch, "scores": config.evaluation.scores,

@@ -16,18 +16,19 @@
 use std::sync::Arc;
 
 use tce_base::Streams;
-use tce_data::{Agent, Standardizer, Transitions, even_standardizer};
+use tce_data::{Agent, Shift, Standardizer, Transitions, even_standardizer};
 use tce_diagnosis::Rated;
 use tce_diagnosis::gaussian::Normals;
 use tce_learn::{
-    Buffer, Densities, Iql, IqlConfig, LabelModels, Member, Regulariser, RegulariserKind, Steps, TerminalHandling,
-    TransitionModel, map_rows, train, train_labels, train_transition_models,
+    Buffer, Densities, Iql, IqlConfig, LabelConfig, LabelModels, Member, Regulariser, RegulariserKind, Steps,
+    TerminalHandling, TransitionModel, map_rows, train, train_labels, train_transition_models,
 };
 use tce_nn::Device;
 use tce_sim::{Simulated, simulate, terminal_rule};
 
 use super::rows::Batch;
 use super::work::{Sources, Work, few};
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::stage::Attempt;
 
@@ -58,7 +59,7 @@ pub struct Models {
 }
 
 /// What the target's dynamics do at the states and actions of `t`; rows in which the physics blows up are left out.
-fn under_target((agent, shift): (Agent, tce_data::Shift), t: &Transitions) -> Result<Transitions> {
+fn under_target((agent, shift): (Agent, Shift), t: &Transitions) -> Result<Transitions> {
     let truth = simulate(agent, shift, &t.observations, &t.actions)?;
     let held: Vec<usize> = (0..t.len()).filter(|&i| truth.held(i)).collect();
     let all = Transitions {
@@ -69,6 +70,93 @@ fn under_target((agent, shift): (Agent, tce_data::Shift), t: &Transitions) -> Re
         ..t.clone()
     };
     Ok(all.select(&held))
+}
+
+/// What the simulator makes of rows.
+#[derive(Default)]
+struct Simulation {
+    /// True target transitions from source states.
+    at_source: Option<Transitions>,
+    /// True target transitions from generated states.
+    at_generated: Option<Transitions>,
+    /// Abundant target rows.
+    abundant: Option<Arc<Transitions>>,
+}
+
+impl Simulation {
+    /// Of the states and actions of target, generated and `source` rows; `sources` are those that are measured.
+    fn of(
+        work: &Work,
+        place: (Agent, Shift),
+        sources: Option<&Sources>,
+        source: Option<&Transitions>,
+        own: &Batch,
+        widest: f32,
+    ) -> Result<Self> {
+        let streams = Streams::new(work.subject.seed).child("diagnosis/models");
+        let many = work.options.abundant / 2;
+        let wide = work.sampler.sample(many.max(own.len()), widest, "abundant")?.rows;
+        let mut all = work.subject.inputs.target.rows.clone();
+        all.extend(&under_target(place, &wide)?);
+        if let Some(source) = source {
+            all.extend(&under_target(place, source)?);
+        }
+        let at_source = |s: &Sources| under_target(place, &few(&s.sorted, own.len(), &streams, "at source"));
+        Ok(Self {
+            at_source: sources.map(at_source).transpose()?,
+            at_generated: Some(under_target(place, &own.kept_rows())?),
+            abundant: Some(Arc::new(all)),
+        })
+    }
+}
+
+/// A reward model of the abundant rows.
+fn abundant_rewards(
+    rows: &Arc<Transitions>,
+    config: &Config,
+    streams: &Streams,
+    attempt: &Attempt,
+    device: &Device,
+) -> Result<LabelModels> {
+    let member = Member {
+        streams: streams.child("abundant rewards"),
+        parts: vec![rows.clone()],
+        standardizer: Standardizer::identity(rows.obs_dim),
+        reward_scale: 1.0,
+        row_scores: None,
+    };
+    let labels = LabelConfig { learn_terminals: false, ..config.labels.training.clone() };
+    let trained = train_labels(&[member], &labels, &mut attempt.checkpoints("abundant-labels")?, device)?;
+    trained.ok_or(Error::Interrupted)
+}
+
+/// V of IQL on target and generated rows, and these rows.
+fn value_function(
+    work: &Work,
+    target: &Arc<Transitions>,
+    generated: &Arc<Transitions>,
+    streams: &Streams,
+    attempt: &Attempt,
+    device: &Device,
+) -> Result<(Iql, Buffer)> {
+    let config = work.subject.config;
+    let member = Member {
+        streams: streams.child("value"),
+        standardizer: even_standardizer(target, Some(generated)),
+        parts: vec![target.clone(), generated.clone()],
+        reward_scale: 1.0,
+        row_scores: None,
+    };
+    let rows = Buffer::new(vec![member], config.learner.batch)?;
+    let iql = IqlConfig { regulariser: RegulariserKind::None, ..config.learner.iql.clone() };
+    let mut value = Iql::new(&rows, &iql, Regulariser::None, work.options.value_steps, device)?;
+    let steps = Steps::new(work.options.value_steps, 0);
+    let mut checkpoints = attempt.checkpoints("value")?;
+    let outcome = train(&mut value, &rows, steps, "value", &mut checkpoints, device, |_, _| Ok::<_, Error>(()))?;
+    match outcome.interrupted {
+        true => Err(Error::Interrupted),
+        false => Ok((value, rows)),
+    }
 }
 
 impl Models {
@@ -90,19 +178,10 @@ impl Models {
         generated.ensure_kept(&config.filter)?;
         let generated = generated.kept_rows();
         let source = sources.map(|s| few(&s.others, many.max(FEWEST_SOURCES), &streams, "source rows"));
-        let (mut at_source, mut at_generated, mut abundant) = (None, None, None);
-        if let Some(place) = work.simulator {
-            let wide = work.sampler.sample(many.max(own.len()), widest, "abundant")?.rows;
-            let mut all = inputs.target.rows.clone();
-            all.extend(&under_target(place, &wide)?);
-            if let Some(source) = &source {
-                all.extend(&under_target(place, source)?);
-            }
-            abundant = Some(Arc::new(all));
-            at_source =
-                sources.map(|s| under_target(place, &few(&s.sorted, own.len(), &streams, "at source"))).transpose()?;
-            at_generated = Some(under_target(place, &own.kept_rows())?);
-        }
+        let Simulation { at_source, at_generated, abundant } = match work.simulator {
+            Some(place) => Simulation::of(work, place, sources, source.as_ref(), own, widest)?,
+            None => Simulation::default(),
+        };
         let standardizer = even_standardizer(&inputs.target.rows, inputs.source.as_ref().map(|s| &s.rows));
         let mut members = Vec::new();
         let mut add = |name: &str, rows: &Arc<Transitions>| {
@@ -132,38 +211,9 @@ impl Models {
 
         let rewards = match &abundant {
             None => None,
-            Some(rows) => {
-                let member = Member {
-                    streams: streams.child("abundant rewards"),
-                    parts: vec![rows.clone()],
-                    standardizer: Standardizer::identity(target.obs_dim),
-                    reward_scale: 1.0,
-                    row_scores: None,
-                };
-                let mut checkpoints = attempt.checkpoints("abundant-labels")?;
-                let labels = tce_learn::LabelConfig { learn_terminals: false, ..config.labels.training.clone() };
-                let trained = train_labels(&[member], &labels, &mut checkpoints, device)?;
-                Some(trained.ok_or(Error::Interrupted)?)
-            }
+            Some(rows) => Some(abundant_rewards(rows, config, &streams, attempt, device)?),
         };
-
-        let member = Member {
-            streams: streams.child("value"),
-            standardizer: even_standardizer(&target, Some(&generated)),
-            parts: vec![target.clone(), generated],
-            reward_scale: 1.0,
-            row_scores: None,
-        };
-        let value_rows = Buffer::new(vec![member], config.learner.batch)?;
-        let iql = IqlConfig { regulariser: RegulariserKind::None, ..config.learner.iql.clone() };
-        let mut value = Iql::new(&value_rows, &iql, Regulariser::None, options.value_steps, device)?;
-        let steps = Steps::new(options.value_steps, 0);
-        let mut checkpoints = attempt.checkpoints("value")?;
-        let outcome =
-            train(&mut value, &value_rows, steps, "value", &mut checkpoints, device, |_, _| Ok::<_, Error>(()))?;
-        if outcome.interrupted {
-            return Err(Error::Interrupted);
-        }
+        let (value, value_rows) = value_function(work, &target, &generated, &streams, attempt, device)?;
         Ok(Self {
             dim: transition.dim(),
             transition,

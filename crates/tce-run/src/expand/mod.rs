@@ -109,6 +109,20 @@ pub struct Expansion {
     pub stage: Stage,
 }
 
+impl Expansion {
+    /// Puts the files into `attempt`, too; returns their names.
+    ///
+    /// # Errors
+    /// If a file can neither be linked nor copied.
+    pub fn link_into(&self, attempt: &Attempt) -> Result<Vec<String>> {
+        let link = |report: &Generated| {
+            attempt.link(&self.stage.file(&report.file), &report.file)?;
+            Ok(report.file.clone())
+        };
+        self.reports.iter().map(link).collect()
+    }
+}
+
 /// The generated rows that `config.mixture` asks for, made or taken from their stage.
 pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
     match config.mixture.generated {

@@ -7,6 +7,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 use tce_base::{plus_minus, read_if_there, sha256_hex};
 use tce_data::ScoreTable;
+use tce_learn::{About, OtherRows};
 use tce_nn::Device;
 use tce_run::config::{Algorithm, Config, LearnerConfig};
 use tce_run::course::{Course, learning};
@@ -15,7 +16,7 @@ use tce_run::inputs::{Inputs, Table};
 use tce_run::judge::Judge;
 use tce_run::layers::ConfigArgs;
 use tce_run::learning::{Learned, MemberData, learn, save_policies};
-use tce_run::methods::{Method, row_scores};
+use tce_run::methods::row_scores;
 use tce_run::own::Own;
 use tce_run::pipeline::seeds;
 use tce_run::processor::Processor;
@@ -94,18 +95,7 @@ impl Learn {
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
         let method = config.learner.algorithm.method();
-        if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
-            return Err(Error::Usage(format!(
-                "--top: found --learner {}, expected bc, whose option it is",
-                method.name
-            )));
-        }
-        if self.extra.is_none() && method.needs == tce_run::methods::SOURCE_ROWS {
-            return Err(Error::Usage(format!(
-                "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
-                method.name
-            )));
-        }
+        self.refuse_what_does_not_fit(&config)?;
         super::refuse_folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
@@ -116,14 +106,7 @@ impl Learn {
         let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
         let (target, extra) = (rows(&inputs.target), inputs.extra.as_ref().map(rows));
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
-        let mut spec = serde_json::json!({
-            "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "own": &self.own, "actions": &inputs.actions,
-            "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
-        });
-        if let Some(source) = &inputs.source {
-            spec["source"] = source.hash.clone().into();
-        }
-        Processor::from(device).sign(&mut spec);
+        let spec = self.spec(&config, &seeds, &inputs, device);
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
         if let Some(report) = found(&out, &spec)? {
@@ -176,6 +159,37 @@ impl Learn {
 }
 
 impl Learn {
+    /// Refuses options and files that the learner has no use for, or that it lacks.
+    fn refuse_what_does_not_fit(&self, config: &Config) -> Result<()> {
+        let method = config.learner.algorithm.method();
+        if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
+            return Err(Error::Usage(format!(
+                "--top: found --learner {}, expected bc, whose option it is",
+                method.name
+            )));
+        }
+        if self.extra.is_none() && method.needs == OtherRows::Source {
+            return Err(Error::Usage(format!(
+                "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
+                method.name
+            )));
+        }
+        Ok(())
+    }
+
+    /// What decides the result.
+    fn spec(&self, config: &Config, seeds: &[u64], inputs: &Inputs, device: &Device) -> serde_json::Value {
+        let mut spec = serde_json::json!({
+            "program": env!("CARGO_PKG_VERSION"), "config": config, "seeds": seeds, "own": &self.own, "actions": &inputs.actions,
+            "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
+        });
+        if let Some(source) = &inputs.source {
+            spec["source"] = source.hash.clone().into();
+        }
+        Processor::from(device).sign(&mut spec);
+        spec
+    }
+
     /// Tells the steps that are to come.
     fn plan(&self, config: &Config, inputs: &Inputs, seeds: usize, out: &Path, device: &Device) {
         let rows = &inputs.target.rows;
@@ -288,10 +302,10 @@ fn render(report: &Report) -> String {
     text
 }
 
-fn list(methods: &[Method; Algorithm::ALL.len()]) -> String {
+fn list(methods: &[About; Algorithm::ALL.len()]) -> String {
     let rows = methods.iter().map(|m| {
         let modes = m.published.map_or_else(String::new, |what| format!("published: {what}"));
-        [m.name, m.description, m.reference, m.needs].map(str::to_owned).into_iter().chain([modes]).collect::<Vec<_>>()
+        [m.name, m.description, m.reference, &m.needs.to_string(), &modes].map(str::to_owned)
     });
     let text =
         listed(&["learner", "what it is", "reference", "besides target rows", "mode (default: corrected)"], rows);

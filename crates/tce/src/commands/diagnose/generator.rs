@@ -8,8 +8,8 @@ use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
-use tce_run::diagnosis::cycles::{AtCycle, Cycles, cycles};
-use tce_run::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
+use tce_run::diagnosis::cycles::{Asked, AtCycle, Cycles, cycles};
+use tce_run::diagnosis::generator::{Consistency, Quality, Tried, consistency, hold_out, step_std};
 use tce_run::error::Result;
 use tce_run::expand::{finisher, label_models, networks};
 use tce_run::inputs::{DataArgs, Inputs};
@@ -163,18 +163,17 @@ impl GeneratorArgs {
                 floors =
                     Some((sw, consistency(place.0, place.1, &real, &step_std(training, &units.live), &units.live)?));
             }
+            let tried = Tried {
+                generator: &generator,
+                models: &models,
+                config: &generator_config,
+                finisher: &finisher,
+                training,
+                held_out: &held_out,
+                place,
+            };
             for sampler in &samplers {
-                let quality = quality(
-                    &generator,
-                    &models,
-                    &generator_config,
-                    sampler,
-                    &finisher,
-                    (training, &held_out),
-                    place,
-                    self.rows,
-                    self.seed,
-                )?;
+                let quality = tried.quality(sampler, self.rows, self.seed)?;
                 tce_base::note!(
                     "{} {}: SW to held-out states {:.3}, consistency {:.3}",
                     process_name(&process),
@@ -204,8 +203,8 @@ impl GeneratorArgs {
         let place = (self.task.agent, self.task.shift);
         let said =
             |n: &AtCycle| tce_base::note!("{}: action RMSE {}, score {}", n.cells()[0], n.cells()[4], n.cells()[10]);
-        let sizes = (self.rows, self.episodes);
-        let cycles = cycles(&inputs, &config, place, self.seed, sizes, &self.data.out, device, said)?;
+        let asked = Asked { place, seed: self.seed, rows: self.rows, episodes: self.episodes };
+        let cycles = cycles(&inputs, &config, asked, &self.data.out, device, said)?;
         output.print(&CyclesReport { task: self.task, episodes: self.episodes, cycles }, render_cycles);
         Ok(())
     }
