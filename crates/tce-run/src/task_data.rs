@@ -55,7 +55,7 @@ fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
     }
 }
 
-/// The target data of a task, collected now if it has to be; see [`Inputs::of_task`].
+/// The target data of a task, collected now if it has to be; see [`crate::inputs::Inputs::of_task`].
 ///
 /// # Errors
 /// If the zoo lacks an actor, or the rows cannot be written.

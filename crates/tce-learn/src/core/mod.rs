@@ -1,8 +1,8 @@
 //! What every training stands on: rows and batches, the one training loop, losses.
 
-pub mod blocks;
-pub mod buffer;
+pub(crate) mod blocks;
+pub(crate) mod buffer;
 pub mod losses;
-pub mod mode;
+pub(crate) mod mode;
 pub mod sequences;
-pub mod training;
+pub(crate) mod training;

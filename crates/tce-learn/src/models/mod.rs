@@ -2,12 +2,12 @@
 //! Meta-DT.
 
 pub mod context_encoder;
-pub mod contexts;
+pub(crate) mod contexts;
 pub mod critic;
 pub mod cvae;
 pub mod dynamics;
 pub mod labels;
-pub mod networks;
+pub(crate) mod networks;
 pub mod pair_model;
 pub mod transformer;
 pub mod transition_model;

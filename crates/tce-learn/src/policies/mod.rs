@@ -2,7 +2,7 @@
 
 pub mod actor;
 pub mod import;
-pub mod mlp_policy;
-pub mod npy;
-pub mod policy;
-pub mod sequence_policy;
+pub(crate) mod mlp_policy;
+pub(crate) mod npy;
+pub(crate) mod policy;
+pub(crate) mod sequence_policy;
