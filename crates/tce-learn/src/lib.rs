@@ -18,7 +18,6 @@
 //! | one-step predictions in both domains, to filter rows and to try policies by | [`dynamics`] |
 //! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
-mod about;
 pub mod algorithms;
 pub mod core;
 mod error;
@@ -26,9 +25,10 @@ pub mod models;
 pub mod policies;
 
 // Modules go by their own names: where they lie is for those who look for them.
+use crate::algorithms::iql_config;
 pub use crate::algorithms::{
-    bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, on_iql, otdf, rebrac, regulariser, sac, selection, srpo,
-    td3_bc,
+    bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac, selection,
+    srpo, td3_bc,
 };
 use crate::core::{blocks, buffer, mode, training};
 pub use crate::core::{losses, sequences};
@@ -37,7 +37,6 @@ pub use crate::models::{critic, cvae, dynamics, labels, pair_model, transformer,
 pub use crate::policies::{actor, import};
 use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
-pub use about::{About, OtherRows};
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
 pub use blocks::map_rows;
@@ -51,6 +50,7 @@ pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, rmse, train_labels};
 pub use meta_dt::{MetaDt, MetaDtConfig};
+pub use method::{About, Built, Method, OtherRows, RowScores, Setup};
 pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;
 pub use otdf::{Otdf, OtdfConfig};

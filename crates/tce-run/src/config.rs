@@ -5,12 +5,10 @@
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
 use tce_data::ScoreTable;
-use tce_learn::{
-    BcConfig, BosaConfig, DaraConfig, DmcConfig, DynamicsConfig, IgdfConfig, IqlConfig, LearnError, MetaDtConfig, Mode,
-    OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
-};
+use tce_learn::{DynamicsConfig, RowScores};
 
 use crate::error::{Error, Result};
+pub use crate::learners::{Algorithm, LearnerConfig};
 
 /// Everything that decides a run's result, apart from its data and seeds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -89,7 +87,9 @@ pub fn used_of_single_stage(
             keys.remove("guidance");
             keys.remove("scores");
         }
-        (_, Algorithm::Dmc) => used = serde_json::json!({ "scores": config.scores }),
+        (_, algorithm) if algorithm.about().scores == RowScores::Density => {
+            used = serde_json::json!({ "scores": config.scores });
+        }
         _ => return None,
     }
     Some(used)
@@ -136,169 +136,6 @@ pub struct MixtureConfig {
     /// λ, the share of source rows in the mixture; the rest are generated. Source: Eq. 9, Table C.5.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lambda: f64,
-}
-
-/// Which algorithm learns the policy; what each of them is, `tce learn --list` tells ([`crate::methods`]).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Algorithm {
-    /// Behaviour cloning.
-    Bc,
-    /// Implicit Q-learning.
-    Iql,
-    /// TD3+BC.
-    Td3Bc,
-    /// ReBRAC.
-    Rebrac,
-    /// DARA, on IQL.
-    Dara,
-    /// SRPO, on IQL.
-    Srpo,
-    /// IGDF, on IQL.
-    Igdf,
-    /// OTDF, on IQL.
-    Otdf,
-    /// BOSA.
-    Bosa,
-    /// DmC's: implicit Q-learning on filtered rows, weighed by their scores.
-    Dmc,
-    /// A decision transformer on contexts of a world model.
-    MetaDt,
-}
-
-/// The learner; the keys of algorithms that are not trained are not looked at.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct LearnerConfig {
-    /// Which algorithm learns the policy; `tce learn --list` tells what each is. Source: the paper has iql.
-    pub algorithm: Algorithm,
-    /// Training steps of the policy.
-    pub steps: u64,
-    /// Rows per step. With other rows half of them are the target's; else all are. Source: Table C.4.
-    #[schemars(range(min = 1))]
-    pub batch: usize,
-    /// Whether observations are standardised.
-    pub standardise: bool,
-    /// Share of the best trajectories that `bc` clones. 1: all of them. Source: "BC-10 %" of Chen et al.
-    #[schemars(range(min = 0.001, max = 1.0))]
-    pub top: f64,
-    /// Implicit Q-learning, and what the rivals that stand on it take from it.
-    pub iql: IqlConfig,
-    /// Behaviour cloning.
-    pub bc: BcConfig,
-    /// TD3+BC. Source: Fujimoto and Gu.
-    pub td3_bc: Td3BcConfig,
-    /// ReBRAC. Source: Tarasov et al.
-    pub rebrac: RebracConfig,
-    /// DARA, besides `learner.iql`.
-    pub dara: DaraConfig,
-    /// SRPO, besides `learner.iql`.
-    pub srpo: SrpoConfig,
-    /// IGDF, besides `learner.iql`.
-    pub igdf: IgdfConfig,
-    /// OTDF, besides `learner.iql`; its regulariser is `learner.behaviour`.
-    pub otdf: OtdfConfig,
-    /// BOSA.
-    pub bosa: BosaConfig,
-    /// DmC, besides `learner.iql`.
-    pub dmc: DmcConfig,
-    /// Meta-DT; `learner.steps` are the transformer's.
-    pub meta_dt: MetaDtConfig,
-    /// The model of the target's behaviour, for regularisers.
-    pub behaviour: RegulariserConfig,
-}
-
-impl LearnerConfig {
-    /// The IQL that the algorithm stands on, where it does.
-    pub fn backbone(&self) -> Option<IqlConfig> {
-        match self.algorithm {
-            Algorithm::Iql | Algorithm::Dara | Algorithm::Srpo | Algorithm::Igdf => Some(self.iql.clone()),
-            Algorithm::Otdf => Some(self.otdf.backbone(&self.iql)),
-            Algorithm::Dmc => Some(self.dmc.backbone(&self.iql)),
-            Algorithm::Bc | Algorithm::Td3Bc | Algorithm::Rebrac | Algorithm::Bosa | Algorithm::MetaDt => None,
-        }
-    }
-
-    /// The behaviour model of the regulariser; as DmC publishes it, one that is not trained.
-    pub fn behaviour(&self) -> RegulariserConfig {
-        match self.algorithm {
-            Algorithm::Dmc => self.dmc.behaviour(&self.behaviour),
-            _ => self.behaviour.clone(),
-        }
-    }
-
-    /// Training steps, by whether there are rows besides the target's.
-    pub fn steps(&self, mixed: bool) -> u64 {
-        match self.algorithm {
-            Algorithm::Bc => self.bc.steps(self.steps, mixed),
-            _ => self.steps,
-        }
-    }
-
-    /// The algorithm's own table, and its name.
-    fn own(&self) -> (&'static str, serde_json::Value) {
-        use serde_json::json;
-        match self.algorithm {
-            Algorithm::Bc => ("bc", json!(self.bc)),
-            Algorithm::Iql => ("iql", json!(self.iql)),
-            Algorithm::Td3Bc => ("td3_bc", json!(self.td3_bc)),
-            Algorithm::Rebrac => ("rebrac", json!(self.rebrac)),
-            Algorithm::Dara => ("dara", json!(self.dara)),
-            Algorithm::Srpo => ("srpo", json!(self.srpo)),
-            Algorithm::Igdf => ("igdf", json!(self.igdf)),
-            Algorithm::Otdf => ("otdf", json!(self.otdf)),
-            Algorithm::Bosa => ("bosa", json!(self.bosa)),
-            Algorithm::Dmc => ("dmc", json!(self.dmc)),
-            Algorithm::MetaDt => ("meta_dt", json!(self.meta_dt)),
-        }
-    }
-
-    /// Whether the method is trained as its public code has it, where that differs from its paper; None where there is one form.
-    pub fn mode(&self) -> Option<Mode> {
-        serde_json::from_value(self.own().1.get("mode")?.clone()).ok()
-    }
-
-    /// The keys that the algorithm looks at: what a run's identity depends on.
-    pub fn used(&self) -> serde_json::Value {
-        let Self { algorithm, steps, batch, standardise, .. } = self;
-        let mut used = serde_json::json!({
-            "algorithm": algorithm, "steps": steps, "batch": batch, "standardise": standardise,
-        });
-        let (name, own) = self.own();
-        used[name] = own;
-        if *algorithm == Algorithm::Bc {
-            used["top"] = serde_json::json!(self.top);
-        }
-        if let Some(iql) = self.backbone() {
-            if iql.regulariser != RegulariserKind::None {
-                used["behaviour"] = serde_json::json!(self.behaviour());
-            }
-            used["iql"] = serde_json::json!(iql);
-        }
-        used
-    }
-
-    fn check(&self) -> Result<()> {
-        let Self { iql, td3_bc, rebrac, dara, srpo, igdf, otdf, bosa, dmc, meta_dt, .. } = self;
-        let iql = self.backbone().unwrap_or_else(|| iql.clone());
-        let checks = [
-            ("iql", iql.check()),
-            ("bc", self.bc.check()),
-            ("td3_bc", td3_bc.check()),
-            ("rebrac", rebrac.check()),
-            ("dara", dara.check()),
-            ("srpo", srpo.check()),
-            ("igdf", igdf.check()),
-            ("otdf", otdf.check()),
-            ("bosa", bosa.check()),
-            ("dmc", dmc.check()),
-            ("meta_dt", meta_dt.check()),
-        ];
-        let named = |(name, check): (&str, std::result::Result<(), LearnError>)| {
-            check.map_err(|e| Error::Usage(format!("learner.{name}: {e}")))
-        };
-        checks.into_iter().try_for_each(named)
-    }
 }
 
 /// How policies are judged.
@@ -361,19 +198,20 @@ impl Config {
         }
         joint.process.check().map_err(|e| Error::Usage(format!("joint.process: {e}")))?;
         joint.sampler.check().map_err(|e| Error::Usage(format!("joint.sampler: {e}")))?;
-        if self.learner.algorithm == Algorithm::Dmc {
+        let about = self.learner.algorithm.about();
+        if about.scores == RowScores::Density {
             let MixtureConfig { generated, source, .. } = self.mixture;
             let scored = matches!(generated, GeneratedRows::None | GeneratedRows::Dmc)
                 && source != SourceRows::Relabelled
                 && (generated, source) != (GeneratedRows::None, SourceRows::None);
             if !scored {
                 return Err(Error::Usage(format!(
-                    "learner.algorithm = \"dmc\": found mixture.generated = {generated:?} and mixture.source = {source:?}, expected \
-                     rows that have scores; use generated = \"dmc\", or \"none\" with source = \"all\", \"nearest\" or \"transport\""
+                    "learner.algorithm = {:?}: found mixture.generated = {generated:?} and mixture.source = {source:?}, expected \
+                     rows that have scores; use generated = \"dmc\", or \"none\" with source = \"all\", \"nearest\" or \"transport\"",
+                    about.name
                 )));
             }
         }
-        self.learner.dmc.check().map_err(|e| Error::Usage(format!("learner.dmc: {e}")))?;
         if self.mixture.generated == GeneratedRows::Tce && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
             return Err(Error::Usage(
                 "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \

@@ -192,7 +192,7 @@ impl Inputs {
     /// Names the setting.
     pub fn ensure_episodes(&self, learner: &LearnerConfig) -> Result<()> {
         let needs = match learner.algorithm {
-            algorithm if algorithm.method().episodes => format!("{} learns sequences", algorithm.method().name),
+            algorithm if algorithm.about().episodes => format!("{} learns sequences", algorithm.about().name),
             _ if learner.top < 1.0 => "learner.top chooses by the returns of episodes".to_owned(),
             _ => return Ok(()),
         };

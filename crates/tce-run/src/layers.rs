@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 use tce_base::FileError;
 use tce_data::{Agent, Quality, Shift, Task};
@@ -14,6 +15,7 @@ use toml::{Table, Value};
 
 use crate::config::{Algorithm, Config};
 use crate::error::{Error, Result};
+use crate::learners::default_tables;
 use crate::variant::Variant;
 use crate::wrong_keys::{did_you_mean_key, in_words};
 
@@ -86,6 +88,15 @@ impl Layered {
     ) -> Result<Self> {
         let mut layered = Self { table: Table::new(), origin: BTreeMap::new() };
         layered.merge_into(parse(DEFAULT, "preset default")?, "preset default", None)?;
+        // What a method's own configuration says, where the preset says nothing.
+        for (name, table) in default_tables() {
+            let missing = layered.table.get("learner").and_then(Value::as_table).is_some_and(|t| !t.contains_key(name));
+            if missing {
+                let table = Table::from_iter([(name.to_owned(), table)]);
+                let table = Table::from_iter([("learner".to_owned(), Value::Table(table))]);
+                layered.merge_into(table, "the method's defaults", None)?;
+            }
+        }
         let known = layered.table.clone();
         let (name, text) = preset.layer();
         layered.merge_into(parse(text, name)?, name, Some(&known))?;
@@ -119,7 +130,8 @@ impl Layered {
         let algorithm = self.table["learner"].get("algorithm").and_then(Value::as_str).unwrap_or_default().to_owned();
         let key = "learner.iql.regulariser";
         let from_preset = self.origin.get(key).is_some_and(|o| presets.contains(&o.as_str()));
-        if from_preset && ["dara", "srpo", "igdf"].contains(&algorithm.as_str()) {
+        let plain = Algorithm::from_str(&algorithm, false).is_ok_and(Algorithm::stands_on_plain_iql);
+        if from_preset && plain {
             self.merge_into(parse_set(&format!("{key}=none"))?, &format!("learner {algorithm}"), None)?;
         }
         Ok(())
@@ -272,7 +284,7 @@ pub struct ConfigArgs {
 impl ConfigArgs {
     /// The same with another learner, if one is given.
     pub fn with_learner(mut self, learner: Option<Algorithm>) -> Self {
-        self.sets.extend(learner.map(|l| format!("learner.algorithm={:?}", l.method().name)));
+        self.sets.extend(learner.map(|l| format!("learner.algorithm={:?}", l.about().name)));
         self
     }
 

@@ -101,7 +101,7 @@ pub fn learn(
         learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
     let updates = config.steps;
     let steps = Steps::new(updates, (updates / 50).max(1));
-    let label = format!("learn {} {seeds:?}", config.algorithm.method().name);
+    let label = format!("learn {} {seeds:?}", config.algorithm.about().name);
     let mut learned = Learned { device: device.into(), ..Learned::default() };
     let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;

@@ -10,6 +10,7 @@ pub mod judge;
 pub mod kept;
 pub mod keys;
 pub mod layers;
+pub mod learners;
 pub mod learning;
 pub mod methods;
 pub mod mixture;

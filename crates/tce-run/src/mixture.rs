@@ -41,7 +41,7 @@ pub fn extra_rows(
     let selected: Option<Vec<ScoredRows>> = match mixture.source {
         SourceRows::None => None,
         SourceRows::All => {
-            let rows = match config.learner.algorithm.looks_at_successors() {
+            let rows = match config.learner.algorithm.about().successors {
                 true => inputs.source_rows()?,
                 false => inputs.source()?.complete(),
             };

@@ -8,13 +8,11 @@ use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig};
 use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
-use tce_learn::{DynamicsConfig, Mode};
+use tce_learn::{DynamicsConfig, Mode, RowScores};
 use tce_nn::Device;
 use tce_zoo::actors::{Arena, Evaluation};
 
-use crate::config::{
-    Algorithm, Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage,
-};
+use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
 use crate::expand::single_stage;
 use crate::expand::{Generated, expand, label_models};
@@ -109,18 +107,23 @@ impl Config {
             GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0 || self.filter.by_dynamics(),
             GeneratedRows::Dmc => true,
         };
-        generating || self.mixture.source != SourceRows::None || self.learner.algorithm == Algorithm::Dmc
+        generating || self.mixture.source != SourceRows::None || self.row_scores() == RowScores::Density
     }
 
     /// Which distances of source rows decide, in the mixture or in the learner, if any.
     pub fn distances(&self) -> Option<SourceRows> {
         match self.mixture.source {
             kind @ (SourceRows::Nearest | SourceRows::Transport) => Some(kind),
-            SourceRows::All if self.source_alone() && self.learner.algorithm == Algorithm::Otdf => {
+            SourceRows::All if self.source_alone() && self.row_scores() == RowScores::Transport => {
                 Some(SourceRows::Transport)
             }
             _ => None,
         }
+    }
+
+    /// By which numbers the learner chooses among other rows.
+    fn row_scores(&self) -> RowScores {
+        self.learner.algorithm.about().scores
     }
 
     /// Whether the rows besides the target's are the source's, as they are.
@@ -130,9 +133,9 @@ impl Config {
 
     /// The number of every source row by which the learner chooses, where it is computed once for all seeds.
     fn source_scores(&self, inputs: &Inputs, root: &Path) -> Result<Option<Arc<Vec<f32>>>> {
-        match self.learner.algorithm {
-            Algorithm::Dmc => Ok(Some(Arc::new(single_stage::scores(inputs, &self.joint.scores, root)?.source))),
-            Algorithm::Otdf if self.source_alone() => {
+        match self.row_scores() {
+            RowScores::Density => Ok(Some(Arc::new(single_stage::scores(inputs, &self.joint.scores, root)?.source))),
+            RowScores::Transport if self.source_alone() => {
                 Ok(Some(closeness(distances(inputs, SourceRows::Transport, root)?)))
             }
             _ => Ok(None),
@@ -221,7 +224,7 @@ pub fn run(
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
     // Who models the dynamics has no use for a terminal row without a successor.
-    let target = match config.learner.algorithm.looks_at_successors() {
+    let target = match config.learner.algorithm.about().successors {
         true => inputs.imitated(&config.target),
         false => inputs.learned_from(&config.target),
     };

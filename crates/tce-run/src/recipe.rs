@@ -48,7 +48,7 @@ fn settings(text: &str) -> BTreeMap<String, String> {
 }
 
 fn budget(config: &Config, mixed: bool) -> Budget {
-    Budget { learner: config.learner.algorithm.method().name.to_owned(), updates: config.learner.steps(mixed) }
+    Budget { learner: config.learner.algorithm.about().name.to_owned(), updates: config.learner.steps(mixed) }
 }
 
 fn presets(task: Task, variant: Variant) -> Vec<Known> {

@@ -22,7 +22,7 @@ impl Variant {
         let algorithm = config.learner.algorithm;
         let mut title = self.title().to_owned();
         if self.own().learner.algorithm != algorithm {
-            title += &format!(", {}", algorithm.method().name);
+            title += &format!(", {}", algorithm.about().name);
         }
         if config.learner.mode() == Some(Mode::Published) {
             title += " (published)";

@@ -26,15 +26,14 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 
-use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Learner, Meter};
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "bc",
     description: "behaviour cloning; of the best trajectories with learner.top",
     reference: "Pomerleau 1989",
@@ -43,7 +42,26 @@ pub const ABOUT: About = About {
     needs: OtherRows::Any,
     successors: false,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for BcConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)))
+    }
+
+    fn steps(&self, steps: u64, mixed: bool) -> u64 {
+        self.steps(steps, mixed)
+    }
+}
 
 /// The configuration of [`Bc`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -33,7 +33,6 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
 
-use crate::about::{About, OtherRows};
 use crate::actor::ActorConfig;
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
@@ -41,13 +40,14 @@ use crate::cvae::{Cvae, CvaeConfig, CvaeLearner, Density, Modelled};
 use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, squared_td_error};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
+use crate::policy::PolicyLearner;
 use crate::selection::need_others;
 use crate::td3_bc::normalised_value;
 use crate::training::{Learner, Meter, Place, prepare};
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "bosa",
     description: "deterministic actor-critic on the support of dynamics and behaviour models",
     reference: "Liu et al. 2024; ODRL",
@@ -56,7 +56,27 @@ pub const ABOUT: About = About {
     needs: OtherRows::Source,
     successors: true,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for BosaConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let learner = Bosa::new(on.buffer, self, on.steps, on.place, on.device)?;
+        Ok(learner.map(|learner| Box::new(learner) as Box<dyn PolicyLearner>))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+}
 
 /// The configuration of [`Bosa`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

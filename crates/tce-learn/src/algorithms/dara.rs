@@ -26,20 +26,19 @@ use serde::{Deserialize, Serialize};
 use tce_nn::burn::tensor::activation::{log_softmax, softmax};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
-use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::losses::member_mean;
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::need_others;
 use crate::training::{Meter, member_noise};
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "dara",
     description: "IQL; source rewards lowered where two classifiers tell the domains apart",
     reference: "Liu et al. 2022; ODRL",
@@ -48,7 +47,31 @@ pub const ABOUT: About = About {
     needs: OtherRows::Source,
     successors: true,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for DaraConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        Ok(Some(Box::new(Dara::new(on.buffer, self, on.iql, regulariser, on.steps, on.device)?)))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(iql.clone())
+    }
+}
 
 /// Added to a probability before its logarithm (ODRL).
 const TINY: f64 = 1e-10;

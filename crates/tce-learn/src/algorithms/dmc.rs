@@ -31,10 +31,10 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
-use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
 use crate::otdf::otdf_policy;
@@ -42,8 +42,7 @@ use crate::regulariser::{Regulariser, RegulariserConfig};
 use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "dmc",
     description: "OTDF's policy; source and guided generated rows chosen and weighed by nearest neighbours",
     reference: "DmC, ECAI 2025",
@@ -52,7 +51,35 @@ pub const ABOUT: About = About {
     needs: OtherRows::Scored,
     successors: true,
     episodes: false,
+    scores: RowScores::Density,
 };
+
+impl Method for DmcConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        Ok(Some(Box::new(Dmc::new(on.buffer, self, on.iql, regulariser, on.steps, on.device)?)))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(self.backbone(iql))
+    }
+
+    fn behaviour(&self, base: &RegulariserConfig) -> RegulariserConfig {
+        self.behaviour(base)
+    }
+}
 
 /// The configuration of [`Dmc`], besides [`IqlConfig`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

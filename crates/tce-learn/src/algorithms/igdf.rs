@@ -27,20 +27,20 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained};
 
-use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::losses::{binary_cross_entropy, member_mean};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
+use crate::policy::PolicyLearner;
 use crate::regulariser::Regulariser;
 use crate::selection::{Selected, host_from, need_others};
 use crate::training::{Learner, Meter, Place, prepare};
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "igdf",
     description: "IQL; source rows chosen by a contrastive model of the target's dynamics",
     reference: "Wen et al. 2024; ODRL",
@@ -49,7 +49,32 @@ pub const ABOUT: About = About {
     needs: OtherRows::Source,
     successors: true,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for IgdfConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        let learner = Igdf::new(on.buffer, self, on.iql, regulariser, on.steps, on.place, on.device)?;
+        Ok(learner.map(|learner| Box::new(learner) as Box<dyn PolicyLearner>))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(iql.clone())
+    }
+}
 
 /// Whose code [`Mode::Published`] follows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]

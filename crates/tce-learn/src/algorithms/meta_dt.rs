@@ -34,10 +34,10 @@ use tce_base::Streams;
 use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{AdamConfig, Device, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
-use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::contexts::{Contexts, Of};
 use crate::error::{LearnError, within};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::networks::Dropout;
 use crate::policy::{Policy, PolicyLearner};
 use crate::sequence_policy::{MAX_CONTEXT, SequencePolicy, SequenceSpec};
@@ -46,8 +46,7 @@ use crate::training::{Learner, Meter, Place, prepare};
 use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes};
 use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "meta-dt",
     description: "a decision transformer on contexts of a world model, zero-shot",
     reference: "Meta-DT 2024",
@@ -56,7 +55,23 @@ pub const ABOUT: About = About {
     needs: OtherRows::Any,
     successors: true,
     episodes: true,
+    scores: RowScores::None,
 };
+
+impl Method for MetaDtConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let learner = MetaDt::new(on.buffer, self, on.place, on.device)?;
+        Ok(learner.map(|learner| Box::new(learner) as Box<dyn PolicyLearner>))
+    }
+}
 
 /// The configuration of [`MetaDt`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

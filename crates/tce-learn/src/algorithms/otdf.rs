@@ -29,19 +29,18 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
-use crate::about::{About, OtherRows};
 use crate::actor::ActionReduction;
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig, PolicyExtraction};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::{Regulariser, RegulariserKind};
 use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "otdf",
     description: "IQL; source rows chosen by optimal transport, policy held to the target's behaviour",
     reference: "Lyu et al. 2025",
@@ -50,7 +49,31 @@ pub const ABOUT: About = About {
     needs: OtherRows::Source,
     successors: true,
     episodes: false,
+    scores: RowScores::Transport,
 };
+
+impl Method for OtdfConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        Ok(Some(Box::new(Otdf::new(on.buffer, self, on.iql, regulariser, on.steps, on.device)?)))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(self.backbone(iql))
+    }
+}
 
 /// The configuration of [`Otdf`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

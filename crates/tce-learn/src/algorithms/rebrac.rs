@@ -22,17 +22,16 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, MlpConfig};
 
-use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::td3_bc::normalised_value;
 use crate::training::Meter;
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "rebrac",
     description: "TD3+BC with a penalty in the critics too, and normalised critics",
     reference: "Tarasov et al. 2023",
@@ -41,7 +40,22 @@ pub const ABOUT: About = About {
     needs: OtherRows::Any,
     successors: false,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for RebracConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        Ok(Some(Box::new(Rebrac::new(on.buffer, self, on.steps, on.device)?)))
+    }
+}
 
 /// The configuration of [`Rebrac`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -26,19 +26,18 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
 
-use crate::about::{About, OtherRows};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::losses::binary_cross_entropy;
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{OnIql, Shape};
 use crate::regulariser::Regulariser;
 use crate::selection::{best_others, kept_rows};
 use crate::training::Meter;
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "srpo",
     description: "IQL; rewards raised where the state looks like one of high value",
     reference: "Xue et al. 2023; IGDF's repository",
@@ -47,7 +46,31 @@ pub const ABOUT: About = About {
     needs: OtherRows::Any,
     successors: true,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for SrpoConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        Ok(Some(Box::new(Srpo::new(on.buffer, self, on.iql, regulariser, on.steps, on.device)?)))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(iql.clone())
+    }
+}
 
 /// The configuration of [`Srpo`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

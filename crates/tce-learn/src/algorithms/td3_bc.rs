@@ -20,17 +20,16 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, MlpConfig, Tensor};
 
-use crate::about::{About, OtherRows};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::training::Meter;
 
-/// What it is.
-pub const ABOUT: About = About {
+const ABOUT: About = About {
     name: "td3-bc",
     description: "TD3 with a behaviour-cloning term",
     reference: "Fujimoto and Gu 2021",
@@ -39,7 +38,22 @@ pub const ABOUT: About = About {
     needs: OtherRows::Any,
     successors: false,
     episodes: false,
+    scores: RowScores::None,
 };
+
+impl Method for Td3BcConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        Ok(Some(Box::new(Td3Bc::new(on.buffer, self, on.steps, on.device)?)))
+    }
+}
 
 /// The configuration of [`Td3Bc`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -83,18 +83,19 @@ impl Learn {
     pub fn run(mut self, output: Output, device: &Device) -> Result<()> {
         // clap asks for the files unless the list is wanted.
         let (Some(target_file), Some(out)) = (self.target.take(), self.out.take()) else {
-            output.print(&Algorithm::ALL.map(Algorithm::method), list);
+            let all: Vec<About> = Algorithm::ALL.iter().map(|a| a.about()).collect();
+            output.print(&all, |all| list(all));
             return Ok(());
         };
         self.config = self.config.with_learner(self.learner);
         self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
-        if self.learner == Some(Algorithm::Dmc) {
+        if self.learner.is_some_and(|learner| learner.about().needs == OtherRows::Scored) {
             // The rows are in the files here; without scores of their own they are scored as source rows are.
             self.config.sets.splice(0..0, ["mixture.generated=none".to_owned(), "mixture.source=all".to_owned()]);
         }
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        let method = config.learner.algorithm.method();
+        let method = config.learner.algorithm.about();
         self.refuse_what_does_not_fit(&config)?;
         super::refuse_folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
@@ -102,7 +103,7 @@ impl Learn {
         let inputs = Inputs::of_files(source, &target_file, self.extra.as_deref(), &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         inputs.ensure_episodes(&config.learner)?;
-        let complete = !config.learner.algorithm.looks_at_successors();
+        let complete = !config.learner.algorithm.about().successors;
         let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
         let (target, extra) = (rows(&inputs.target), inputs.extra.as_ref().map(rows));
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
@@ -161,7 +162,7 @@ impl Learn {
 impl Learn {
     /// Refuses options and files that the learner has no use for, or that it lacks.
     fn refuse_what_does_not_fit(&self, config: &Config) -> Result<()> {
-        let method = config.learner.algorithm.method();
+        let method = config.learner.algorithm.about();
         if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
             return Err(Error::Usage(format!(
                 "--top: found --learner {}, expected bc, whose option it is",
@@ -195,7 +196,7 @@ impl Learn {
         let rows = &inputs.target.rows;
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, out);
         let mixed = inputs.extra.is_some();
-        course.learning(config.learner.algorithm.method().name, config, mixed);
+        course.learning(config.learner.algorithm.about().name, config, mixed);
         if !self.no_verdict {
             if mixed {
                 course.learning(FLOOR, &Config { learner: floor_learner(config), ..config.clone() }, false);
@@ -302,7 +303,7 @@ fn render(report: &Report) -> String {
     text
 }
 
-fn list(methods: &[About; Algorithm::ALL.len()]) -> String {
+fn list(methods: &[About]) -> String {
     let rows = methods.iter().map(|m| {
         let modes = m.published.map_or_else(String::new, |what| format!("published: {what}"));
         [m.name, m.description, m.reference, &m.needs.to_string(), &modes].map(str::to_owned)

@@ -77,7 +77,7 @@ impl Run {
         if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::FLOORS.contains(v))) {
             return Err(Error::Usage(format!(
                 "--learner {}: found floors alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
-                learner.method().name,
+                learner.about().name,
                 self.variant.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
             )));
         }
