@@ -195,8 +195,8 @@ impl LearnerConfig {
         };
         // As the chosen method makes it of the table.
         named("iql", self.backbone().unwrap_or_else(|| self.iql.clone()).check())?;
-        let others = Algorithm::ALL.iter().filter(|a| **a != Algorithm::Iql);
-        others.map(|a| named(a.about().table, self.method(*a).check())).collect()
+        let mut others = Algorithm::ALL.iter().filter(|a| **a != Algorithm::Iql);
+        others.try_for_each(|a| named(a.about().table, self.method(*a).check()))
     }
 }
 

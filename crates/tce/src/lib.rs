@@ -1,6 +1,9 @@
 //! The `tce` program as a library: what the command line says, and how results and errors are told. What it does stands in the other
 //! crates.
 
+// An error ends the command: nobody waits for its copy.
+#![allow(clippy::result_large_err)]
+
 mod bench;
 mod commands;
 mod conclusion;

@@ -6,8 +6,8 @@ use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{Bounds, Diagnosis, Implied};
 
-use super::{number, plain};
-use crate::html::counted;
+use super::numbers::{number, plain};
+use crate::html::parts::counted;
 use crate::svg::minus;
 
 /// Errors of implied actions in a table.

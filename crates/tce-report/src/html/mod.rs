@@ -11,11 +11,11 @@ mod cost;
 mod curves;
 mod findings;
 mod methods;
-mod parts;
+pub(crate) mod parts;
 mod runs;
 mod scores;
 mod statistics;
-mod words;
+pub(crate) mod words;
 
 use parts::{classes, estimate, one, percent, range, said, signed, title_cell};
 pub(crate) use parts::{counted, decades, document, duration};

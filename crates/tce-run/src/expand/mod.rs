@@ -5,122 +5,40 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use tce_augment::augmenter::support_of;
-use tce_augment::config::{FilterConfig, LabelsConfig, Terminal};
-use tce_augment::finish::{Finisher, TerminalRule, everything_rejected, fit_labels, label_members};
+use tce_augment::config::{FilterConfig, Terminal};
+use tce_augment::finish::{Finisher, TerminalRule, everything_rejected};
 use tce_augment::two_stage::{Draw, Generator};
 use tce_augment::units::Units;
 use tce_base::Streams;
 use tce_data::{LoadOptions, Support, Transitions, load, save_d4rl};
 use tce_diffusion::{Chunks, Sampler};
-use tce_learn::{LabelConfig, LabelErrors, LabelModels, Labelled, Learner};
-use tce_nn::{Device, NamedParameters};
+use tce_learn::{LabelErrors, LabelModels, Labelled};
+use tce_nn::Device;
 use tce_sim::terminal_rule;
 
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::Inputs;
 use crate::judge::Judge;
 use crate::stage::{Attempt, Stage};
 
+mod expansion;
+mod labels;
 mod networks;
 pub mod single_stage;
 
+pub use expansion::{Expansion, Generated};
+pub use labels::label_models;
+use labels::terminals;
 pub use networks::networks;
-
-/// What generating rows leaves behind, per member.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Generated {
-    /// The file in the stage.
-    pub file: String,
-    /// Rows sampled.
-    pub sampled: usize,
-    /// Rows that passed the filter.
-    pub kept: usize,
-    /// Share of inferred action components outside of the box, before clipping.
-    pub outside_box: f64,
-    /// Share of terminal rows.
-    pub terminal: f64,
-    /// Network evaluations per row, both stages of sampling together.
-    pub evaluations: usize,
-    /// Errors of the member's label models on held-out target rows.
-    pub labels: Option<LabelErrors>,
-}
-
-/// The inverse dynamics and reward models of a whole population: trained on the target rows, or taken from their stage.
-pub fn label_models(
-    inputs: &Inputs,
-    config: &LabelsConfig,
-    seeds: &[u64],
-    root: &Path,
-    device: &Device,
-) -> Result<(LabelModels, Stage, Vec<Option<LabelErrors>>)> {
-    #[derive(Serialize)]
-    struct Spec<'a> {
-        inputs: InputSpec,
-        seeds: &'a [u64],
-        labels: &'a LabelConfig,
-    }
-    let learn_terminals = terminals(inputs, config) == Terminal::Learned;
-    let labels = LabelConfig { learn_terminals, ..config.training.clone() };
-    let spec = Spec { inputs: inputs.spec(learn_terminals), seeds, labels: &labels };
-    tce_base::begin_step("label models");
-    let stage = Stage::open(root, "stages/labels", &spec, device)?;
-    let source = inputs.source.as_ref().filter(|_| learn_terminals).map(|s| Arc::new(s.rows.clone()));
-    let members = label_members(Arc::new(inputs.target.rows.clone()), source, seeds);
-    let file = "labels.safetensors";
-    let path = stage.file(file);
-    if let Some(errors) = stage.summary::<Vec<Option<LabelErrors>>>()? {
-        let mut models = LabelModels::new(&members, &labels, device)?;
-        models.restore(&NamedParameters::load(&path)?, &path)?;
-        return Ok((models, stage, errors));
-    }
-    let attempt = stage.attempt()?;
-    let models = fit_labels(&members, &labels, &mut attempt.checkpoints("labels")?, device)?;
-    let errors = models.errors();
-    models.state().save(&attempt.file(file))?;
-    attempt.finish(&[file.to_owned()], &errors)?;
-    Ok((models, stage, errors))
-}
-
-/// Where terminal flags of generated rows come from, for these files: a benchmark robot's rule only where the user named the robot.
-fn terminals(inputs: &Inputs, config: &LabelsConfig) -> Terminal {
-    let any = std::iter::once(&inputs.target).chain(&inputs.source).any(|t| t.rows.terminals.contains(&true));
-    config.terminal_for(inputs.agent.is_some(), any)
-}
 
 /// Filters and labels rows of `units` as `config` says, for the data of `inputs`.
 pub fn finisher<'a>(units: &'a Units, models: &'a LabelModels, config: &'a Config, inputs: &Inputs) -> Finisher<'a> {
     let rule = |agent| -> TerminalRule { Arc::new(move |state: &[f32]| terminal_rule(agent, state)) };
     let terminal = terminals(inputs, &config.labels);
     Finisher { units, models, filter: &config.filter, terminal, rule: inputs.agent.map(rule) }
-}
-
-/// Generated tables, one per member, and where they are.
-pub struct Expansion {
-    /// The tables.
-    pub tables: Vec<Arc<Transitions>>,
-    /// A score per row, where the rows have any ([`single_stage`]).
-    pub scores: Vec<Option<Arc<Vec<f32>>>>,
-    /// What was noticed.
-    pub reports: Vec<Generated>,
-    /// The stage with the files.
-    pub stage: Stage,
-}
-
-impl Expansion {
-    /// Puts the files into `attempt`, too; returns their names.
-    ///
-    /// # Errors
-    /// If a file can neither be linked nor copied.
-    pub fn link_into(&self, attempt: &Attempt) -> Result<Vec<String>> {
-        let link = |report: &Generated| {
-            attempt.link(&self.stage.file(&report.file), &report.file)?;
-            Ok(report.file.clone())
-        };
-        self.reports.iter().map(link).collect()
-    }
 }
 
 /// The generated rows that `config.mixture` asks for, made or taken from their stage.

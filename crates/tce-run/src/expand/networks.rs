@@ -9,7 +9,7 @@ use tce_augment::work::Work;
 use tce_diffusion::{Process, Schedule, ScoreModel, Target};
 use tce_nn::Device;
 
-use super::label_models;
+use super::labels::label_models;
 use crate::config::Config;
 use crate::error::Result;
 use crate::inputs::{InputSpec, Inputs};

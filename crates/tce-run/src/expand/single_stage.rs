@@ -14,7 +14,7 @@ use tce_data::{DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, d
 use tce_diffusion::{Process, Sampler, ScoreModel, Target, TrainConfig};
 use tce_nn::{Device, NamedParameters, cpu};
 
-use super::{Expansion, Generated};
+use super::expansion::{Expansion, Generated};
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::inputs::{InputSpec, Inputs};

@@ -126,9 +126,7 @@ fn a_line_makes_it_known_everywhere() {
 #[test]
 fn it_learns_like_any_other() {
     let mut rows = Transitions::new(2, 1);
-    (0..64).for_each(|i| {
-        rows.push(&[i as f32, -1.0 * i as f32], &[0.5], 1.0, &[i as f32 + 1.0, 0.0], false, i % 16 == 15)
-    });
+    (0..64).for_each(|i| rows.push(&[i as f32, -(i as f32)], &[0.5], 1.0, &[i as f32 + 1.0, 0.0], false, i % 16 == 15));
     let rows = Arc::new(rows);
     let data = |seed| MemberData {
         seed,

@@ -55,10 +55,10 @@ struct Augmented {
 impl Augment {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        super::refuse_existing(&self.out, self.writing.force)?;
-        super::refuse_inputs(&self.out, &[&self.source, &self.target])?;
+        super::refuse::existing(&self.out, self.writing.force)?;
+        super::refuse::inputs_as_output(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
-        super::refuse_folder(&self.cache)?;
+        super::refuse::folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);

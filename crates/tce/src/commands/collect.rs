@@ -58,7 +58,7 @@ struct Collected {
 impl Collect {
     /// Runs the command.
     pub fn run(self, output: Output) -> Result<()> {
-        super::refuse_existing(&self.out, self.force)?;
+        super::refuse::existing(&self.out, self.force)?;
         if self.rows == 0 || self.lanes == 0 {
             return Err(Error::Usage("--rows and --lanes must be at least 1".into()));
         }

@@ -371,7 +371,7 @@ fn render_checks(all: &[Checked]) -> String {
 
 impl Convert {
     fn run(self, output: Output) -> Result<()> {
-        super::refuse_existing(&self.output, self.writing.force)?;
+        super::refuse::existing(&self.output, self.writing.force)?;
         let options = |own: &Own| LoadOptions { all_columns: true, ..own.load_options() };
         let Loaded { transitions, columns, mut report } = read_with(&self.own, &self.input, options)?.1;
         let kept: Vec<(&str, &[f32])> =

@@ -97,7 +97,7 @@ impl Learn {
         let seeds = seeds(self.seed, self.seeds)?;
         let method = config.learner.algorithm.about();
         self.refuse_what_does_not_fit(&config)?;
-        super::refuse_folder(&out)?;
+        super::refuse::folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target_file, self.extra.as_deref(), &self.own)?;

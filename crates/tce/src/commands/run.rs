@@ -96,7 +96,7 @@ impl Run {
             })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        super::refuse_folder(&self.data.out)?;
+        super::refuse::folder(&self.data.out)?;
         tce_sim::open_library()?;
         // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
         let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);

@@ -108,7 +108,7 @@ impl TrainSac {
         if !(0.0..=1.0).contains(&self.explore) {
             return Err(Error::Usage(format!("--explore {}: expected a share from 0 to 1", self.explore)));
         }
-        super::refuse_folder(&self.out)?;
+        super::refuse::folder(&self.out)?;
         let goal = Goal {
             steps: self.steps,
             until: self.until_score,

@@ -215,7 +215,7 @@ impl Keep {
         card.attach(&mut parameters);
         let name = card.name().expect("it has a role");
         let path = self.out.join(format!("{name}.safetensors"));
-        super::refuse_existing(&path, self.force)?;
+        super::refuse::existing(&path, self.force)?;
         let bytes = parameters.to_half_bytes();
         write_atomically(&path, &bytes)?;
         let shown = Shown { name, bytes: bytes.len(), sha256: tce_base::sha256_hex(&bytes), card };

@@ -4,16 +4,12 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_base::{Streams, interrupted};
 use tce_data::{ScoreTable, Shift};
-use tce_learn::Policy;
 use tce_run::error::{Error, Result};
 use tce_sim::film::{Film, FilmOptions};
 use tce_sim::{Ending, Recording};
 use tce_video::{Studio, VideoFile, parse_size, parse_video};
-use tce_zoo::actors::{Arena, evaluate_recorded};
-
-use super::{Evaluate, Evaluated};
+use tce_zoo::actors::{Arena, Evaluation};
 
 /// Options of the film.
 #[derive(Debug, Args)]
@@ -88,28 +84,30 @@ impl FilmArgs {
                 return Err(Error::Usage(format!("{option}: found {value}, expected a number from {low} to {high}")));
             }
         }
-        super::super::refuse_existing(video.path(), self.force)?;
+        crate::commands::refuse::existing(video.path(), self.force)?;
         video.clone().prepare().map(Some).map_err(as_ours)
     }
 }
 
-impl Evaluate {
-    /// Evaluates the only policy and films it.
-    pub(super) fn filmed(&self, studio: Studio, policy: &Policy, arena: Arena) -> Result<Evaluated> {
-        let roll = |arena, episodes| {
-            evaluate_recorded(policy, arena, episodes, Streams::new(self.seed), !self.sample, interrupted)
-        };
-        let (evaluation, recording) = roll(arena, self.episodes)?;
+impl FilmArgs {
+    /// Films the first of the episodes that `roll` rolls out in `arena`: so many of them, recorded.
+    pub fn film(
+        &self,
+        studio: Studio,
+        arena: Arena,
+        roll: impl Fn(Arena, usize) -> Result<(Evaluation, Recording)>,
+        episodes: usize,
+    ) -> Result<(Evaluation, Filmed)> {
+        let (evaluation, recording) = roll(arena, episodes)?;
         let mut recordings = Vec::new();
         if arena.shift != Shift::Source {
             recordings.push(roll(Arena::new(arena.agent, Shift::Source, ScoreTable::default()), 1)?.1);
         }
         recordings.push(recording);
-        let options =
-            FilmOptions { size: self.film.video_size, seconds: self.film.video_seconds, speed: self.film.video_speed };
+        let options = FilmOptions { size: self.video_size, seconds: self.video_seconds, speed: self.video_speed };
         let film = Film::new(recordings, options)?;
         let bytes = studio.write(&film).map_err(as_ours)?;
-        let file = self.film.video.as_ref().expect("there is a studio").path().to_owned();
+        let file = self.video.as_ref().expect("there is a studio").path().to_owned();
         let [width, height] = film.size();
         let frames = film.frames();
         let longest = film.longest();
@@ -125,9 +123,7 @@ impl Evaluate {
         tce_base::note!("{note}");
         let panels = film.recordings().map(Shown::of).collect();
         let (interval, stride) = (film.interval(), film.stride());
-        let video = Some(Filmed { file, bytes, width, height, frames, interval, stride, panels });
-        let policy = self.policies[0].clone();
-        Ok(Evaluated { policy, environment: format!("{}-{}", arena.agent, arena.shift), evaluation, video })
+        Ok((evaluation, Filmed { file, bytes, width, height, frames, interval, stride, panels }))
     }
 }
 

@@ -10,6 +10,8 @@ use serde::Serialize;
 use tce_base::{Streams, interrupted, mean_std};
 use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_run::error::{Error, Result};
+#[cfg(feature = "video")]
+use tce_zoo::actors::evaluate_recorded;
 use tce_zoo::actors::{Arena, Evaluation, evaluate, load_policy};
 
 use crate::output::{Output, mark_best, table};
@@ -62,7 +64,13 @@ impl Evaluate {
         let policies: Vec<_> = self.policies.iter().map(|p| load_policy(p, agent)).collect::<tce_zoo::Result<_>>()?;
         #[cfg(feature = "video")]
         if let Some(studio) = studio {
-            let film = self.filmed(studio, &policies[0], arena)?;
+            let roll = |arena, episodes| {
+                let streams = Streams::new(self.seed);
+                Ok(evaluate_recorded(&policies[0], arena, episodes, streams, !self.sample, interrupted)?)
+            };
+            let (evaluation, video) = self.film.film(studio, arena, roll, self.episodes)?;
+            let environment = format!("{agent}-{shift}");
+            let film = Evaluated { policy: self.policies[0].clone(), environment, evaluation, video: Some(video) };
             output.print(&[film], |all| render(all));
             return Ok(());
         }
