@@ -14,7 +14,7 @@ use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use crate::files::{read_if_there, write_json};
 use crate::format::about;
-use crate::progress::{Counter, LINES, in_place};
+use crate::terminal::{Counter, LINES, in_place};
 
 /// A step of a command.
 #[derive(Clone, Debug, PartialEq)]

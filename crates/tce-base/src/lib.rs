@@ -5,10 +5,14 @@ pub mod course;
 pub mod files;
 pub mod format;
 pub mod interrupt;
+pub mod metrics;
 pub mod owner;
 pub mod progress;
 pub mod random;
+pub mod scratch;
 pub mod sealed;
+pub mod statistics;
+pub mod terminal;
 pub mod words;
 
 pub use course::{Headline, Step, begin_step, end_course, plan_course};
@@ -17,8 +21,15 @@ pub use files::{
     read_if_there, sha256_file, sha256_hex, write_atomically, write_json, write_json_first,
 };
 pub use interrupt::{interrupted, listen_for_interrupts};
+pub use metrics::Metrics;
 pub use owner::Owner;
-pub use progress::{Progress, set_quiet};
+pub use progress::Progress;
 pub use random::{Rng, Streams};
+pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
+pub use statistics::{mean_std, plus_minus};
+pub use terminal::set_quiet;
 pub use words::{did_you_mean, file_inside, nearest};
+
+/// What files say about who wrote them.
+pub const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));

@@ -1,70 +1,19 @@
 //! Long work: a bar with what is left on a terminal, a plain line now and then elsewhere.
 
-use std::io::IsTerminal;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, LazyLock, Mutex};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use console::style;
-use indicatif::{MultiProgress, ProgressBar, ProgressState, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use crate::course;
 use crate::format::{count, duration, rate};
+use crate::terminal::{Counter, LINES, in_place, quiet, say};
 
 /// Time between two plain lines where there is no terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(15);
 /// Time between two looks at a bar that does not move, so that what is left does not stand still.
 const TICK: Duration = Duration::from_millis(500);
-
-/// All lines that change in place. One thing draws them, so that bars side by side and notes between them leave no line behind.
-pub(crate) static LINES: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
-
-static QUIET: AtomicBool = AtomicBool::new(false);
-
-/// Whether progress that starts from now on is shown at all.
-pub fn set_quiet(quiet: bool) {
-    QUIET.store(quiet, Ordering::Relaxed);
-}
-
-/// Whether lines can change in place.
-pub(crate) fn in_place() -> bool {
-    static TERMINAL: LazyLock<bool> =
-        LazyLock::new(|| std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb"));
-    *TERMINAL && !QUIET.load(Ordering::Relaxed)
-}
-
-/// A line of text on stderr, above all bars. Written by [`note!`](crate::note).
-#[doc(hidden)]
-pub fn say(text: &str) {
-    let print = || match text.strip_prefix("warning:") {
-        Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
-        None => eprintln!("{text}"),
-    };
-    // Without bars there is nothing to put aside.
-    if in_place() { LINES.suspend(print) } else { print() }
-}
-
-/// `eprintln!` for notes beside the results: where bars are drawn, the note stands above them.
-#[macro_export]
-macro_rules! note {
-    ($($text:tt)*) => { $crate::progress::say(&format!($($text)*)) };
-}
-
-/// How far a piece of work is. Apart from the bar, because the line above the bars asks while they are drawn.
-pub(crate) struct Counter {
-    pub(crate) label: String,
-    pub(crate) total: u64,
-    pub(crate) done: AtomicU64,
-    pub(crate) started: Instant,
-}
-
-impl Counter {
-    /// Seconds that are left at the rate so far; None where that says nothing yet.
-    pub(crate) fn left(&self) -> Option<f64> {
-        let (done, seconds) = (self.done.load(Ordering::Relaxed), self.started.elapsed().as_secs_f64());
-        (done > 0 && seconds > 2.0).then(|| self.total.saturating_sub(done) as f64 * seconds / done as f64)
-    }
-}
 
 /// The progress of one piece of work of known length. Cheap to call often; safe to share between threads. A bar that is dropped before
 /// its end leaves no line.
@@ -105,7 +54,7 @@ impl Progress {
             bar
         });
         let plain = Mutex::new(Plain { last: started, message: String::new() });
-        Self { unit, counter, even, bar, quiet: QUIET.load(Ordering::Relaxed), plain }
+        Self { unit, counter, even, bar, quiet: quiet(), plain }
     }
 
     /// Reports that `n` more units are done.

@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Transitions;
-use crate::check::ACTION_TOLERANCE;
+
+/// Actions may leave the box [-1, 1] by this much: float32 rounding of a tanh.
+pub(crate) const ACTION_TOLERANCE: f32 = 1e-4;
 
 /// Least and greatest action of every column, in the user's units. Inside the program, `low` is -1 and `high` is 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -6,12 +6,10 @@ use std::hash::{DefaultHasher, Hasher};
 
 use serde::Serialize;
 
+use crate::actions::ACTION_TOLERANCE;
 use crate::agents::{ANT_ZEROS, describe, infer_agents};
 use crate::moments::Moments;
 use crate::{ActionRange, Agent, Rows, Support, Transitions};
-
-/// Actions may leave the box [-1, 1] by this much: float32 rounding of a tanh.
-pub(crate) const ACTION_TOLERANCE: f32 = 1e-4;
 
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]

@@ -52,7 +52,7 @@ pub use neighbours::{NeighbourOptions, Units, lambda_quantile_select, nn_distanc
 pub use quality::Quality;
 pub use reference::{ReferenceScores, ScoreTable, Shift, reference_scores};
 pub use rows::Rows;
-pub use standardise::{RELATIVE_FLOOR, Standardizer};
+pub use standardise::{RELATIVE_FLOOR, Standardizer, even_standardizer};
 pub use support::{Bound, Clip, Constant, Levels, Support, UnitGroup};
 pub use task::{Task, parse_agent, parse_environment};
 pub use trajectories::{CLEAR_GAP, Choice, ENOUGH_ROWS, Measure, choose_trajectories, choose_trajectories_with};

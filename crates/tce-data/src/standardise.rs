@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::Rows;
 use crate::moments::Moments;
+use crate::{Rows, Transitions};
 
 /// The smallest std that a live dimension is divided by, relative to the median std of the live dimensions.
 ///
@@ -136,6 +136,22 @@ impl Standardizer {
             self.dead.iter().for_each(|&d| row[d] = self.mean[d]);
         }
     }
+}
+
+/// The map under which states of a half-and-half batch have zero mean and unit variance: target and other rows count the
+/// same, however many more of the others there are.
+pub fn even_standardizer(target: &Transitions, other: Option<&Transitions>) -> Standardizer {
+    let d = target.obs_dim;
+    let mut few = Vec::new();
+    if let Some(other) = other {
+        let n = target.len().min(other.len());
+        (0..n).for_each(|i| few.extend_from_slice(other.observation(i * other.len() / n)));
+    }
+    let mut tables = vec![Rows::new(&target.observations, d)];
+    if !few.is_empty() {
+        tables.push(Rows::new(&few, d));
+    }
+    Standardizer::fit_on(&tables)
 }
 
 #[cfg(test)]

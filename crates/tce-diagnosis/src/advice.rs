@@ -18,6 +18,7 @@ use std::fmt;
 
 use crate::diagnosis::Diagnosis;
 use crate::memorisation;
+pub use crate::numbers::percent;
 
 /// The part of the target data's score that the policy of the rows may lose.
 pub const LOSS: f64 = 0.1;
@@ -63,16 +64,6 @@ impl fmt::Display for Advice {
             parts => write!(f, " Nothing else speaks against them: {}.", parts.join("; ")),
         }
     }
-}
-
-/// A share as whole percent; with a decimal near 0 and 100 %, and what would round to 0 said to be below 0.1 %.
-pub fn percent(share: f64) -> String {
-    let value = 100.0 * share;
-    let near_an_end = (value > 0.0 && value < 9.95) || (99.0..100.0).contains(&value);
-    if value > 0.0 && value < 0.05 {
-        return "< 0.1 %".into();
-    }
-    if near_an_end { format!("{value:.1} %") } else { format!("{value:.0} %") }
 }
 
 /// How the score of the policy that the rows teach compares.

@@ -289,7 +289,7 @@ impl Choice {
             Choice { lambda: 0.0, .. } => "Add no real source rows to them: the data alone speak for λ = 0.".into(),
             Choice { lambda, .. } => format!(
                 "Add the nearest source rows to them: the data alone speak for a share of {}, λ = {lambda}.",
-                crate::advice::percent(*lambda)
+                crate::numbers::percent(*lambda)
             ),
         }
     }

@@ -65,6 +65,16 @@ impl Histogram {
     }
 }
 
+/// A share as whole percent; with a decimal near 0 and 100 %, and what would round to 0 said to be below 0.1 %.
+pub fn percent(share: f64) -> String {
+    let value = 100.0 * share;
+    let near_an_end = (value > 0.0 && value < 9.95) || (99.0..100.0).contains(&value);
+    if value > 0.0 && value < 0.05 {
+        return "< 0.1 %".into();
+    }
+    if near_an_end { format!("{value:.1} %") } else { format!("{value:.0} %") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

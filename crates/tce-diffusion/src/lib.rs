@@ -7,6 +7,7 @@
 //! Rows are row-major `f32` matrices of standardised, live dimensions; whoever calls standardises, drops dimensions
 //! without spread, and undoes both afterwards.
 
+mod cycles;
 mod data;
 mod error;
 pub mod metrics;
@@ -18,6 +19,7 @@ mod target;
 mod train;
 mod until_done;
 
+pub use cycles::{CycleEnd, UntilDone};
 pub use data::{Condition, Part, ScoreData, present};
 pub use error::DiffusionError;
 pub use model::{Chunks, Request, ScoreModel, uniform_labels};
@@ -26,4 +28,3 @@ pub use process::{Edm, Grid, Increment, Level, Precondition, Process, Start, Ve,
 pub use sampler::{Denoiser, Guided, Sampler};
 pub use target::Target;
 pub use train::{Schedule, TrainConfig, Trainer};
-pub use until_done::{CycleEnd, UntilDone};

@@ -13,7 +13,7 @@ use tce_nn::{
     on_threads_of, tensor,
 };
 
-use crate::until_done::Found;
+use crate::cycles::Found;
 use crate::{DiffusionError, NetworkConfig, Process, ScoreData, ScoreModel, ScoreNetwork};
 
 /// Steps between two reports of the loss.

@@ -43,7 +43,8 @@ pub enum LearnError {
 }
 
 impl LearnError {
-    pub(crate) fn invalid(
+    /// A value that cannot be used: its field, what was found, what is expected, and what to do.
+    pub fn invalid(
         field: impl Into<String>,
         found: impl ToString,
         expected: impl Into<String>,

@@ -19,46 +19,26 @@
 //! | what a policy is worth by the rows alone | [`mod@fitted_q`] |
 //! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
 
-pub mod actor;
-pub mod bc;
-mod blocks;
-pub mod bosa;
-mod buffer;
-mod contexts;
-pub mod critic;
-pub mod cvae;
-pub mod dara;
-pub mod deterministic;
-pub mod dmc;
-pub mod dynamics;
+pub mod algorithms;
+pub mod core;
 mod error;
-pub mod fitted_q;
-pub mod igdf;
-pub mod import;
-pub mod iql;
-pub mod labels;
-pub mod losses;
-pub mod meta_dt;
-mod mlp_policy;
-mod mode;
-mod networks;
-mod npy;
-pub mod on_iql;
-pub mod otdf;
-pub mod pair_model;
-mod policy;
-pub mod rebrac;
-pub mod regulariser;
-pub mod sac;
-pub mod selection;
-mod sequence_policy;
-pub mod sequences;
-pub mod srpo;
-pub mod td3_bc;
-mod training;
-pub mod transformer;
-pub mod transition_model;
-pub mod world_model;
+pub mod models;
+pub mod policies;
+
+// Modules go by their own names: where they lie is for those who look for them.
+use crate::algorithms::iql_config;
+pub use crate::algorithms::{
+    bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac, selection,
+    srpo, td3_bc,
+};
+use crate::core::{blocks, buffer, mode, training};
+pub use crate::core::{losses, sequences};
+use crate::models::{context_encoder, contexts, networks};
+pub use crate::models::{
+    critic, cvae, dynamics, fitted_q, labels, pair_model, transformer, transition_model, world_model,
+};
+pub use crate::policies::{actor, import};
+use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig};
@@ -74,17 +54,17 @@ pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, rmse, train_labels};
 pub use meta_dt::{MetaDt, MetaDtConfig};
+pub use method::{About, Built, Method, OtherRows, RowScores, Setup};
 pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;
 pub use otdf::{Otdf, OtdfConfig};
-pub use policy::{Memory, Policy, PolicyKind};
+pub use policy::{Memory, Policy, PolicyKind, PolicyLearner};
 pub use rebrac::{Rebrac, RebracConfig};
 pub use regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 pub use sequence_policy::{SequencePolicy, SequenceSpec};
 pub use srpo::{Srpo, SrpoConfig};
 pub use td3_bc::{Td3Bc, Td3BcConfig};
 pub use training::{
-    Journal, Lane, Learner, Meter, Outcome, Place, PolicyLearner, Report, Steps, member_noise, prepare, train,
-    train_side_by_side,
+    Journal, Lane, Learner, Meter, Outcome, Place, Report, Steps, member_noise, prepare, train, train_side_by_side,
 };
 pub use transition_model::{Densities, TransitionConfig, TransitionModel, train_transition_models};

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use maud::{Markup, html};
 
 use crate::analysis::Analysis;
-use crate::html::term;
+use crate::html::words::term;
 use crate::study::{Method, Study, short};
 use crate::svg::{self, Axis, Frame, Line, Point, Series};
 

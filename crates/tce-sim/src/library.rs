@@ -19,60 +19,10 @@ use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 use mujoco_rs::mujoco_c::{mjData, mjLogConfig, mjModel, mjVFS, mjfLogHandler, mjtNum};
 
 use crate::SimError;
-
-/// The version that the replayed data sets confirm; 4.0.0 drifts on Ant (p99 about 1e-3).
-const VERSION: &str = "3.17.0";
-
-/// The library's name, in the wheel and wherever it is looked for.
-const FILE: &str = "libmujoco.so.3.17.0";
-
-/// Names a library of the user's own, which is then the only one that is tried.
-const VARIABLE: &str = "TCE_MUJOCO_LIB";
+use crate::error::{FILE, LibraryError, VARIABLE, VERSION};
 
 /// Where the build script put the library: for `cargo run`, tests and benches.
 const BUILT_WITH: Option<&str> = option_env!("TCE_MUJOCO_BUILD_DIR");
-
-/// Why there is no simulator.
-#[derive(Debug, thiserror::Error)]
-pub enum LibraryError {
-    /// No library lies where one is looked for.
-    #[error("{FILE}, the simulator, is not here. Looked for it at:\n{places}{HELP}")]
-    Missing {
-        /// A line for each place.
-        places: String,
-    },
-    /// The variable that names a library names none.
-    #[error("{VARIABLE} is `{}`: found no such file, expected the path of {FILE}.\n{HELP}", path.display())]
-    Named {
-        /// What the variable says.
-        path: PathBuf,
-    },
-    /// The file that was found is no library, or not one for this machine.
-    #[error("{}: this is not a MuJoCo that can be used here: {reason}.\nPut {FILE} in its place.\n{HELP}", path.display())]
-    Unusable {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        reason: String,
-    },
-    /// The processor is older than MuJoCo's build.
-    #[error("this processor lacks AVX, which {FILE} needs; commands that do not simulate work without it")]
-    Processor,
-    /// Another MuJoCo than the one the models are made for.
-    #[error("{}: found MuJoCo {found}, expected {VERSION}, with which the models were checked.\n{HELP}", path.display())]
-    Version {
-        /// The file.
-        path: PathBuf,
-        /// Its version.
-        found: String,
-    },
-}
-
-/// What to do about it.
-const HELP: &str = "To get the library:\n  \
-     pip install --no-deps --only-binary=:all: --python-version 3.12 --target mujoco-3.17.0 mujoco==3.17.0\n  \
-     export TCE_MUJOCO_LIB=$PWD/mujoco-3.17.0/mujoco/libmujoco.so.3.17.0\n\
-     or copy that file beside the program. Only commands that simulate need it.";
 
 /// Opens libmujoco, unless it is open, and returns where it lies.
 ///

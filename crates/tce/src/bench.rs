@@ -8,7 +8,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use serde::Serialize;
-use tce_base::{Streams, random::fill_normal};
+use tce_base::Streams;
+use tce_base::random::fill_normal;
 use tce_data::{
     Agent, NeighbourOptions, Rows, Shift, Standardizer, Transitions, TransportOptions, nn_distances, transport_costs,
 };
@@ -24,12 +25,11 @@ use tce_learn::{
     MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
 };
 use tce_nn::{Checkpoints, Device, is_cpu, on_threads_of, product_rate, tensor};
+use tce_run::config::Algorithm;
+use tce_run::error::Result;
+use tce_run::layers::{Layered, Preset};
+use tce_run::methods::build;
 use tce_sim::{CollectOptions, UniformActor, collect};
-
-use crate::config::Algorithm;
-use crate::error::Result;
-use crate::layers::{Layered, Preset};
-use crate::methods::build;
 
 /// HalfCheetah's observations and actions, the hidden width, and rows per batch.
 const OBS: usize = 17;
@@ -145,7 +145,7 @@ pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Meas
     let mut before = product_rate(PROBE);
     for _ in 0..repeats {
         if tce_base::interrupted() {
-            return Err(crate::error::Error::Interrupted);
+            return Err(tce_run::error::Error::Interrupted);
         }
         let started = Instant::now();
         let mut calls = 0u32;
@@ -205,7 +205,7 @@ fn members(seeds: u64) -> Vec<Member> {
     (0..seeds).map(member).collect()
 }
 
-/// Ten steps a call of learners side by side, as [`crate::learning`] trains them.
+/// Ten steps a call of learners side by side, as [`tce_run::learning`] trains them.
 fn learning<L: Learner + ?Sized + 'static>(device: &Device, lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
     let (device, seeds) = (device.clone(), lanes.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
     let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = lanes.into_iter().unzip();
@@ -231,7 +231,7 @@ fn row_products(widths: &[usize]) -> (f64, f64) {
     (all as f64, (widths[0] * widths[1]) as f64)
 }
 
-/// The seeds as [`crate::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
+/// The seeds as [`tce_run::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
 fn lanes<L>(on: &On, seeds: u64, lane: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
     let all = members(seeds);
     let size = if is_cpu(&on.device) { 1 } else { all.len() };

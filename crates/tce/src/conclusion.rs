@@ -1,9 +1,9 @@
 //! What came out of a run, in sentences: how far every method is above or below the best baseline, whether that is more than seeds do,
 //! and what to do next. The gap comes before the doubt.
 
-use crate::layers::Preset;
-use crate::output::mean_std;
-use crate::verdict::SURE;
+use tce_base::mean_std;
+use tce_run::layers::Preset;
+use tce_run::verdict::SURE;
 
 /// Learner seeds below which the spread between seeds is not known well enough to be believed.
 const FEW: usize = 3;

@@ -16,12 +16,12 @@ use rand::RngExt;
 use tce_base::{Rng, Streams, write_sealed};
 use tce_data::{LoadOptions, Standardizer, Transitions, load};
 use tce_diffusion::ScoreModel;
-use tce_learn::{Buffer, Member, MetaDt, MetaDtConfig, Place, Policy, PolicyLearner, import::load_npz};
+use tce_learn::import::load_npz;
+use tce_learn::{Buffer, Member, MetaDt, MetaDtConfig, Place, Policy, PolicyLearner};
 use tce_nn::{Checkpoints, NamedParameters, cpu};
-
-use crate::layers::{Layered, Preset};
-use crate::sweep::Manifest;
-use crate::zoo::{Card, Exhibit};
+use tce_run::layers::{Layered, Preset};
+use tce_run::sweep::Manifest;
+use tce_zoo::exhibits::{Card, Exhibit};
 
 /// Counts bytes that are taken.
 struct Counting;

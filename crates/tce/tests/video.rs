@@ -1,5 +1,7 @@
 //! `tce evaluate --video`, through the real binary.
 
+#![cfg(feature = "video")]
+
 mod common;
 
 use std::fs;

@@ -9,7 +9,8 @@ use std::cell::LazyCell;
 
 use rayon::prelude::*;
 
-use super::report::{Dropped, EpisodeEnds, Successors};
+use super::marks::{Resolved, Table};
+use super::report::{EpisodeEnds, Successors};
 use super::rows::tell;
 use super::steps::{Steps, doubts, in_place};
 
@@ -17,39 +18,6 @@ use super::steps::{Steps, doubts, in_place};
 const MOST_ENVIRONMENTS: usize = 1024;
 /// Rows that are looked at for a column's scale.
 const SAMPLE: usize = 20_000;
-
-/// What a file says row by row, before anything is dropped.
-pub(super) struct Table<'a> {
-    pub dim: usize,
-    pub observations: &'a [f32],
-    /// Stored successors, if there are any.
-    pub next_observations: Option<&'a [f32]>,
-    pub terminals: &'a [bool],
-    pub timeouts: Option<&'a [bool]>,
-    /// Steps after which the collector cut an episode.
-    pub limit: Option<usize>,
-}
-
-/// What is made of it.
-#[derive(Debug, PartialEq)]
-pub(super) struct Resolved {
-    pub timeouts: Vec<bool>,
-    /// Rows that stay.
-    pub keep: Vec<bool>,
-    /// Rows whose successor is known. The others are terminal.
-    pub known: Vec<bool>,
-    pub successors: Successors,
-    pub ends: EpisodeEnds,
-    pub dropped: Dropped,
-    pub warnings: Vec<String>,
-}
-
-impl Resolved {
-    fn new(timeouts: Vec<bool>, successors: Successors, ends: EpisodeEnds) -> Self {
-        let (keep, known) = (vec![true; timeouts.len()], vec![true; timeouts.len()]);
-        Self { timeouts, keep, known, successors, ends, dropped: Dropped::default(), warnings: Vec::new() }
-    }
-}
 
 /// Whether two states are the same, up to how they are rounded.
 ///
@@ -235,16 +203,27 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
         let doubts = doubts(table, &out);
         out.warnings.extend(doubts);
     }
-    if !breaks.is_empty() && joined_timeouts.len() * 2 > marks.len() {
+    if !breaks.is_empty() {
+        reconcile(&mut out, &marks, &joined_timeouts, &breaks);
+    }
+    breaks.iter().for_each(|&i| out.timeouts[i] = true);
+    out.warnings.extend(displaced_terminals(table, joined));
+    out.warnings.extend(held_terminals(table, joined));
+    out
+}
+
+/// Follows the `breaks` between states where the `marks` of time-outs contradict them. `joined_timeouts` are marks that the next row continues.
+fn reconcile(out: &mut Resolved, marks: &[usize], joined_timeouts: &[usize], breaks: &[usize]) {
+    if joined_timeouts.len() * 2 > marks.len() {
         joined_timeouts.iter().for_each(|&i| out.timeouts[i] = false);
         out.ends = EpisodeEnds::Continuity;
         out.warnings.push(format!(
             "`timeouts` contradicts the states: it marks {}, which the next row continues, and not {}, where s' is not the next row's \
              state. Episodes end where the states say; correct `timeouts` (is it shifted?)",
-            tell(&joined_timeouts),
-            tell(&breaks)
+            tell(joined_timeouts),
+            tell(breaks)
         ));
-    } else if !breaks.is_empty() {
+    } else {
         // A mark one row from where an episode visibly ends is that end's.
         let beside = |i: &&usize| {
             breaks.binary_search(&(**i + 1)).is_ok() || **i > 0 && breaks.binary_search(&(**i - 1)).is_ok()
@@ -262,13 +241,9 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
         }
         out.warnings.push(format!(
             "`timeouts` does not mark {}, where s' is not the next row's state: episodes end there, too",
-            tell(&breaks)
+            tell(breaks)
         ));
     }
-    breaks.iter().for_each(|&i| out.timeouts[i] = true);
-    out.warnings.extend(displaced_terminals(table, joined));
-    out.warnings.extend(held_terminals(table, joined));
-    out
 }
 
 /// Told where a terminal row is followed by its own successor, which is terminal as well.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::formats::Raw;
 use super::hdf5::{Column, Hdf5};
-use super::load::LoadOptions;
+use super::options::LoadOptions;
 use super::report::Layout;
 use crate::{DataError, Problem};
 

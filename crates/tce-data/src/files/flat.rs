@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 
 use super::formats::{Format, Raw};
 use super::hdf5::{Column, Hdf5};
-use super::load::LoadOptions;
+use super::options::LoadOptions;
 use super::report::Layout;
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem};
@@ -42,6 +42,50 @@ fn name<'a>(file: &Hdf5, names: &[&'a str], warnings: &mut Vec<String>) -> Optio
     Some(found)
 }
 
+/// What may tell where episodes end, and was not read beside `timeouts`.
+fn other_marks(file: &Hdf5, timeouts: Option<&str>) -> Vec<String> {
+    let others = TIMEOUTS.iter().filter(|name| file.has(name) && Some(**name) != timeouts);
+    let others = others.filter(|_| timeouts.is_some());
+    let of_two =
+        others.map(|name| format!("`{name}` was not read, because `{}` is there", timeouts.unwrap_or_default()));
+    let hints = ANY_END.iter().chain(&HINTS).filter(|name| timeouts.is_none() && file.has(name));
+    let hints =
+        hints.map(|name| format!("`{name}` was not read; if it tells where episodes end, store it as `timeouts`"));
+    of_two.chain(hints).collect()
+}
+
+/// Puts the state in the place of successors that are not finite, which only terminal rows may have, and marks them as not `known`.
+fn fill_gaps(
+    file: &Hdf5,
+    name: &str,
+    stored: &mut Column,
+    observed: &Column,
+    terminal: &[bool],
+    known: &mut Option<Vec<bool>>,
+    warnings: &mut Vec<String>,
+) -> Result<(), DataError> {
+    let dim = stored.dim;
+    let gaps: Vec<usize> =
+        (0..terminal.len()).filter(|i| stored.data[i * dim..(i + 1) * dim].iter().any(|x| !x.is_finite())).collect();
+    if gaps.iter().any(|&i| !terminal[i]) {
+        // The plain reading says where and what.
+        file.matrix(name)?;
+    }
+    if !gaps.is_empty() {
+        warnings.push(format!(
+            "`{name}` is not finite in {} terminal rows, whose next state is taken as not known",
+            gaps.len()
+        ));
+        let known = known.get_or_insert_with(|| vec![true; terminal.len()]);
+        for i in gaps {
+            known[i] = false;
+            let state = &observed.data[i * dim..(i + 1) * dim];
+            stored.data[i * dim..(i + 1) * dim].copy_from_slice(state);
+        }
+    }
+    Ok(())
+}
+
 impl Format for Flat {
     fn recognises(&self, _file: &Hdf5) -> bool {
         true
@@ -54,13 +98,7 @@ impl Format for Flat {
         let (observations, actions, rewards) = (needed(&OBSERVATIONS)?, needed(&ACTIONS)?, needed(&REWARDS)?);
         let (next, terminals, timeouts) = (field(&NEXT), field(&TERMINALS), field(&TIMEOUTS));
         let terminals = terminals.ok_or_else(|| without_terminals(file))?;
-        let other_marks = |name: &&&str| file.has(name) && Some(**name) != timeouts;
-        for name in TIMEOUTS.iter().filter(other_marks).filter(|_| timeouts.is_some()) {
-            warnings.push(format!("`{name}` was not read, because `{}` is there", timeouts.unwrap_or_default()));
-        }
-        for name in ANY_END.iter().chain(&HINTS).filter(|name| timeouts.is_none() && file.has(name)) {
-            warnings.push(format!("`{name}` was not read; if it tells where episodes end, store it as `timeouts`"));
-        }
+        warnings.extend(other_marks(file, timeouts));
 
         let (mut stored, mut observed) = (None, None);
         // The two large columns are inflated side by side, each through a handle of its own.
@@ -104,24 +142,7 @@ impl Format for Flat {
         }
         let mut known = known;
         if let Some((name, c)) = next.zip(stored.as_mut()) {
-            let gaps: Vec<usize> =
-                (0..rows).filter(|i| c.data[i * c.dim..(i + 1) * c.dim].iter().any(|x| !x.is_finite())).collect();
-            if gaps.iter().any(|&i| !terminal[i]) {
-                // The plain reading says where and what.
-                file.matrix(name)?;
-            }
-            if !gaps.is_empty() {
-                warnings.push(format!(
-                    "`{name}` is not finite in {} terminal rows, whose next state is taken as not known",
-                    gaps.len()
-                ));
-                let known = known.get_or_insert_with(|| vec![true; rows]);
-                for i in gaps {
-                    known[i] = false;
-                    let state = &observed.data[i * c.dim..(i + 1) * c.dim];
-                    c.data[i * c.dim..(i + 1) * c.dim].copy_from_slice(state);
-                }
-            }
+            fill_gaps(file, name, c, &observed, &terminal, &mut known, &mut warnings)?;
         }
         if observed.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
             warnings.push("states are stored as float64; they were rounded to float32".to_owned());

@@ -6,16 +6,13 @@
 //! | Minari | groups `episode_0`, `episode_1`, ... | [`super::minari`] |
 //! | robomimic | a group `data` of groups `demo_0`, `demo_1`, ... | [`super::robomimic`] |
 //!
-//! A further layout is a file with a [`Format`] and a line in [`FORMATS`].
+//! A further layout is a file with a [`Format`] and a line in `FORMATS` of `load.rs`.
 
 use std::collections::BTreeMap;
 
-use super::flat::Flat;
 use super::hdf5::Hdf5;
-use super::load::LoadOptions;
-use super::minari::Minari;
+use super::options::LoadOptions;
 use super::report::Layout;
-use super::robomimic::Robomimic;
 use crate::{DataError, Problem};
 
 /// One layout.
@@ -26,9 +23,6 @@ pub(super) trait Format: Sync {
     /// All rows, before anything is put right or dropped.
     fn read(&self, file: &Hdf5, options: &LoadOptions) -> Result<Raw, DataError>;
 }
-
-/// In the order in which they are tried; the last one takes every file.
-pub(super) const FORMATS: [&dyn Format; 3] = [&Minari, &Robomimic, &Flat];
 
 /// The rows of a file, as they stand there. All columns have one entry per row.
 pub(super) struct Raw {

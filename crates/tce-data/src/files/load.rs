@@ -3,30 +3,20 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::episodes::{self, Table};
+use super::episodes;
 use super::flat::Flat;
-use super::formats::FORMATS;
+use super::formats::Format;
 use super::hdf5::Hdf5;
-use super::minari::main_file;
+use super::marks::Table;
+use super::minari::{Minari, main_file};
+use super::options::LoadOptions;
 use super::report::{Dropped, EpisodeEnds, Layout, LoadReport, Successors};
+use super::robomimic::Robomimic;
 use super::rows;
 use crate::{DataError, Problem, Transitions};
 
-/// What the caller knows about the file.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct LoadOptions {
-    /// Steps after which the collector cut an episode (`None`: never): 1000 for the benchmark's robots. Only looked at where the file has
-    /// no `timeouts`.
-    pub step_limit: Option<usize>,
-    /// State and action dimension that the file must have, for example [`Agent::dims`](crate::Agent::dims).
-    pub dims: Option<(usize, usize)>,
-    /// Further columns to read, shape (N,) or (N, 1).
-    pub columns: Vec<String>,
-    /// Read every further column that there is (D4RL's and OTDF's layouts); what cannot be read as one is told.
-    pub all_columns: bool,
-    /// Look at files of ours, too: somebody may have changed them since.
-    pub distrust_own: bool,
-}
+/// All layouts, in the order in which they are tried; the last one takes every file.
+const FORMATS: [&dyn Format; 3] = [&Minari, &Robomimic, &Flat];
 
 /// A validated data set.
 #[derive(Clone, Debug, PartialEq)]

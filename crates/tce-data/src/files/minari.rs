@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use super::episodes_in_groups::{Together, field, numbered, unless_empty};
 use super::formats::{Format, Raw};
 use super::hdf5::Hdf5;
-use super::load::LoadOptions;
+use super::options::LoadOptions;
 use super::report::Layout;
 use crate::{DataError, Problem};
 

@@ -1,6 +1,6 @@
 //! How far a state is from the next one: what tells where episodes end in files that hold no successors, or none that tell anything.
 
-use super::episodes::{Resolved, Table};
+use super::marks::{Resolved, Table};
 use super::rows::tell;
 
 /// The steps from row to row, in units of the columns' spreads.

@@ -1,7 +1,6 @@
 //! From runs to the figures of the report. Everything that is printed, drawn or warned about is decided here.
 
 use serde::Serialize;
-use tce_base::Streams;
 use tce_data::{Shift, Task};
 
 use crate::error::{ReportError, Result};
@@ -10,12 +9,14 @@ use crate::paper::{self, PaperTable, Printed};
 use crate::stats::{Bootstrap, Draw, Estimate, Scores};
 use crate::study::{Method, Run, Study, order};
 
+mod analyse;
 mod compare;
 mod opening;
 mod recipes;
 mod recommended;
 mod warnings;
 
+pub use analyse::analyse;
 pub use opening::{gap_words, opening, verdict_words};
 pub use recipes::{Recipes, thousands};
 pub use recommended::Recommendation;
@@ -268,156 +269,4 @@ impl Comparison {
         aggregate.over_floors.as_ref()?;
         Some(aggregate.over_seeds[0].point - self.standard()?.over_seeds[0].point)
     }
-}
-
-/// The figures of `study`.
-///
-/// # Errors
-/// If there is no run in it.
-pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
-    if study.runs.is_empty() {
-        let what = match study.missing.first() {
-            Some(first) => format!(
-                "found no finished run, expected at least one; {} are not done, the first is {} ({})",
-                study.missing.len(),
-                first.what,
-                first.why
-            ),
-            None => {
-                "found no finished run, expected at least one; make some with `tce sweep launch` or `tce run`".into()
-            }
-        };
-        return Err(ReportError::Nothing { path: study.directory.clone().into(), what });
-    }
-    let bootstrap =
-        Bootstrap { streams: Streams::new(options.seed), resamples: options.resamples, level: options.level };
-    let tasks = tasks_of(study);
-    let runs = |task: &Task, method: &Method| -> Vec<&Run> {
-        study.runs.iter().filter(|r| r.task == *task && r.method == method.id).collect()
-    };
-    let by_task: Vec<Vec<Vec<&Run>>> =
-        tasks.iter().map(|t| study.methods.iter().map(|m| runs(t, m)).collect()).collect();
-    let scores: Vec<Vec<Vec<f64>>> = by_task
-        .iter()
-        .map(|methods| methods.iter().map(|runs| runs.iter().filter_map(|r| score(r)).collect()).collect())
-        .collect();
-
-    let mut tables = Vec::new();
-    for shift in Shift::ALL {
-        let places: Vec<usize> = (0..tasks.len()).filter(|k| tasks[*k].shift == shift).collect();
-        if !places.is_empty() {
-            tables.push(shift_table(study, &bootstrap, shift, &places, &tasks, &by_task, &scores)?);
-        }
-    }
-    let comparison = compare::compare(study, &bootstrap, &tasks, &scores)?;
-    let published: Vec<bool> = study
-        .methods
-        .iter()
-        .map(|m| m.variant.ends_with("-published") || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
-        .collect();
-    let warnings = warnings::warnings(study, &tasks, &scores, comparison.as_ref(), &published);
-    Ok(Analysis {
-        name: study.name.clone(),
-        methods: study.methods.clone(),
-        published,
-        tables,
-        comparison,
-        recipes: Recipes::of(study),
-        recommendations: recommended::recommendations(study),
-        warnings,
-        level: options.level,
-        resamples: options.resamples,
-    })
-}
-
-/// The study's tasks in the paper's order, those without a result included.
-fn tasks_of(study: &Study) -> Vec<Task> {
-    let mut tasks: Vec<Task> = Vec::new();
-    for task in study.runs.iter().map(|r| r.task).chain(study.missing.iter().map(|m| m.task)) {
-        if !tasks.contains(&task) {
-            tasks.push(task);
-        }
-    }
-    tasks.sort_by_key(order);
-    tasks
-}
-
-fn mean_std(values: &[f64]) -> (f64, Option<f64>) {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-    (mean, (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()))
-}
-
-fn shift_table(
-    study: &Study,
-    bootstrap: &Bootstrap,
-    shift: Shift,
-    places: &[usize],
-    tasks: &[Task],
-    by_task: &[Vec<Vec<&Run>>],
-    scores: &[Vec<Vec<f64>>],
-) -> Result<ShiftTable> {
-    let paper = paper::table(shift);
-    let columns = paper.map_or(0, |p| p.columns.len());
-    let methods = &study.methods;
-    let mut rows = Vec::new();
-    for &t in places {
-        let stats: Vec<Option<(f64, Option<f64>)>> =
-            scores[t].iter().map(|s| (!s.is_empty()).then(|| mean_std(s))).collect();
-        let best = stats.iter().flatten().map(|s| s.0).fold(f64::MIN, f64::max);
-        let floors = stats.iter().zip(methods).filter(|(_, m)| m.floor).filter_map(|(s, _)| s.map(|s| s.0));
-        let floor = floors.reduce(f64::max);
-        let cell = |(k, stat): (usize, &Option<(f64, Option<f64>)>)| {
-            stat.map(|(mean, std)| Cell {
-                mean,
-                std,
-                seeds: scores[t][k].len(),
-                diverged: by_task[t][k].iter().filter(|r| matches!(r.member.verdict, Verdict::Diverged(_))).count(),
-                best: mean >= best,
-                above_floors: if methods[k].floor { None } else { floor.map(|f| mean > f) },
-            })
-        };
-        rows.push(Row {
-            task: tasks[t],
-            cells: stats.iter().enumerate().map(cell).collect(),
-            paper: paper.and_then(|p| p.row(&tasks[t])).map_or_else(|| vec![None; columns], <[_]>::to_vec),
-        });
-    }
-    let total = |name: &str, lists: Vec<Vec<f64>>| -> Result<Option<Total>> {
-        if lists.is_empty() {
-            return Ok(None);
-        }
-        let tasks = lists.len();
-        let scores = Scores::new(lists)?;
-        let estimate = bootstrap.intervals(name, Draw::Runs, &[&scores], |s| vec![s[0].total()])?[0];
-        Ok(Some(Total { estimate, tasks }))
-    };
-    let mut totals = Vec::new();
-    let mut against = Vec::new();
-    for (m, method) in methods.iter().enumerate() {
-        let lists = |want: &dyn Fn(usize) -> bool| -> Vec<Vec<f64>> {
-            let kept = places.iter().enumerate().filter(|(k, t)| want(*k) && !scores[**t][m].is_empty());
-            kept.map(|(_, &t)| scores[t][m].clone()).collect()
-        };
-        let name = format!("total/{shift}/{}", method.id);
-        totals.push(total(&name, lists(&|_| true))?);
-        let paper_method = paper::counterpart(&method.variant).filter(|_| method.plain);
-        let Some((paper_method, column)) = paper_method.and_then(|p| Some((p, paper?.column(p)?))) else { continue };
-        let printed = |k: usize| rows[k].paper[column];
-        let ours = total(&format!("against/{name}"), lists(&|k| printed(k).is_some()))?;
-        if let Some(ours) = ours {
-            let both = (0..rows.len()).filter(|k| rows[*k].cells[m].is_some());
-            let paper = both.filter_map(|k| printed(k).map(|p| p.mean)).sum();
-            against.push(Against { method: m, paper_method: paper_method.into(), ours, paper });
-        }
-    }
-    let paper_totals = (0..columns)
-        .map(|c| {
-            let figures = rows.iter().filter_map(|r| r.paper[c]);
-            figures.fold((0.0, 0), |(sum, n), p| (sum + p.mean, n + 1))
-        })
-        .collect();
-    let doubt = recipes::doubt(study, shift);
-    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against, doubt })
 }

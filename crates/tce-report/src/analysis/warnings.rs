@@ -16,6 +16,11 @@ fn list<'a>(names: impl IntoIterator<Item = &'a str>) -> String {
     names.into_iter().collect::<Vec<_>>().join(", ")
 }
 
+/// Adds a warning.
+fn warn(out: &mut Vec<Warning>, text: String, details: Vec<String>) {
+    out.push(Warning { text, details });
+}
+
 pub(super) fn warnings(
     study: &Study,
     tasks: &[Task],
@@ -24,12 +29,29 @@ pub(super) fn warnings(
     published: &[bool],
 ) -> Vec<Warning> {
     let mut out = Vec::new();
-    let mut warn = |text: String, details: Vec<String>| out.push(Warning { text, details });
-    let title = |m: usize| study.methods[m].title.as_str();
+    of_runs(study, &mut out);
+    of_methods(study, tasks, scores, published, &mut out);
+    match comparison {
+        None => warn(&mut out, "No run has a score: there are no statistics.".into(), Vec::new()),
+        Some(comparison) => of_comparison(study, tasks, comparison, &mut out),
+    }
+    let programs: BTreeSet<&str> = study.runs.iter().map(|r| r.folder.program.as_str()).collect();
+    if programs.len() > 1 {
+        let text = format!("The runs were made by different programs: {}.", list(programs));
+        warn(&mut out, text, Vec::new());
+    }
+    for note in &study.notes {
+        warn(&mut out, note.clone(), Vec::new());
+    }
+    out
+}
 
+/// Runs without a result, with two, or without a score.
+fn of_runs(study: &Study, out: &mut Vec<Warning>) {
     if !study.missing.is_empty() {
         let all = study.runs.len() + study.missing.len();
         warn(
+            out,
             format!(
                 "Partial results: {} of {all} runs have no result. They are counted nowhere; where they are not missing at random, \
                  the figures are biased.",
@@ -39,7 +61,7 @@ pub(super) fn warnings(
         );
     }
     if !study.conflicts.is_empty() {
-        warn(
+        warn(out,
             "Two copies of the same work came to different results; the first one is shown. This is a fault of determinism."
                 .into(),
             study.conflicts.clone(),
@@ -55,6 +77,7 @@ pub(super) fn warnings(
     });
     if !diverged.is_empty() {
         warn(
+            out,
             format!(
                 "{} could not act to the end of {} evaluation: counted as {DIVERGED} points, a random policy's score, and marked † in \
                  the tables.",
@@ -68,13 +91,20 @@ pub(super) fn warnings(
     if !unscored.is_empty() {
         let n = plural(unscored.len(), "run has", "runs have");
         warn(
+            out,
             format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
             unscored,
         );
     }
+}
+
+/// What scores, seeds and baselines of the methods lack.
+fn of_methods(study: &Study, tasks: &[Task], scores: &[Vec<Vec<f64>>], published: &[bool], out: &mut Vec<Warning>) {
+    let title = |m: usize| study.methods[m].title.as_str();
     let modes: Vec<&str> = (0..published.len()).filter(|m| published[*m]).map(title).collect();
     if !modes.is_empty() {
         warn(
+            out,
             format!(
                 "Published mode: {} follow the published code, its known faults included. They stand for what was published, not \
                  for what the method can do.",
@@ -87,6 +117,7 @@ pub(super) fn warnings(
     if let (Some(least), Some(most)) = (counts.first(), counts.last()) {
         if *least < ENOUGH_SEEDS {
             warn(
+                out,
                 format!(
                     "Few seeds: {} for each task and method, where the paper has {ENOUGH_SEEDS}. Intervals from so few seeds are too \
                      narrow{}.",
@@ -98,6 +129,7 @@ pub(super) fn warnings(
         }
         if least != most {
             warn(
+                out,
                 format!(
                     "Unequal numbers of seeds, {least} to {most}. Every task counts the same in a mean, however many runs it has."
                 ),
@@ -118,6 +150,7 @@ pub(super) fn warnings(
         let part = |(title, n): (&&str, &usize)| format!("{title} on {n} of {}", tasks.len());
         let parts: Vec<String> = bare.iter().map(part).collect();
         warn(
+            out,
             format!(
                 "Baselines are missing: {}. A score says little without the baselines it has to beat.",
                 parts.join("; ")
@@ -125,59 +158,50 @@ pub(super) fn warnings(
             Vec::new(),
         );
     }
-    match comparison {
-        None => warn("No run has a score: there are no statistics.".into(), Vec::new()),
-        Some(c) => {
-            if c.tasks.len() < tasks.len() {
-                warn(
-                    format!(
-                        "Means over tasks are of the {} of {} tasks on which every compared method has a score.",
-                        c.tasks.len(),
-                        tasks.len()
-                    ),
-                    Vec::new(),
-                );
-            }
-            if !c.left_out.is_empty() {
-                warn(
-                    format!(
-                        "Left out of the means over tasks, for lack of scores on more than half of the tasks: {}.",
-                        list(c.left_out.iter().map(|m| title(*m)))
-                    ),
-                    Vec::new(),
-                );
-            }
-            let finding = |wanted: Finding| -> Vec<String> {
-                let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);
-                let gap = |a: &Aggregate| match gap_words(c.gap(a).unwrap_or(f64::NAN)) {
-                    level if level.starts_with("level") => "level".to_owned(),
-                    gap => gap,
-                };
-                c.methods.iter().filter(is).map(|a| format!("{} ({})", title(a.method), gap(a))).collect()
-            };
-            if let Some(floor) = c.best_floor() {
-                let worse = finding(Finding::Worse);
-                let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
-                if !worse.is_empty() {
-                    let names = list(worse.iter().map(String::as_str));
-                    warn(format!("Shown to fall short of the best baseline, {}: {names}.", title(floor)), Vec::new());
-                }
-                if !open.is_empty() {
-                    let names = list(open.iter().map(String::as_str));
-                    warn(
-                        format!("Not proved to differ from the best baseline, {}: {names}.", title(floor)),
-                        Vec::new(),
-                    );
-                }
-            }
+}
+
+/// What means over tasks leave out, and what is not proved.
+fn of_comparison(study: &Study, tasks: &[Task], c: &Comparison, out: &mut Vec<Warning>) {
+    let title = |m: usize| study.methods[m].title.as_str();
+    if c.tasks.len() < tasks.len() {
+        warn(
+            out,
+            format!(
+                "Means over tasks are of the {} of {} tasks on which every compared method has a score.",
+                c.tasks.len(),
+                tasks.len()
+            ),
+            Vec::new(),
+        );
+    }
+    if !c.left_out.is_empty() {
+        warn(
+            out,
+            format!(
+                "Left out of the means over tasks, for lack of scores on more than half of the tasks: {}.",
+                list(c.left_out.iter().map(|m| title(*m)))
+            ),
+            Vec::new(),
+        );
+    }
+    let finding = |wanted: Finding| -> Vec<String> {
+        let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);
+        let gap = |a: &Aggregate| match gap_words(c.gap(a).unwrap_or(f64::NAN)) {
+            level if level.starts_with("level") => "level".to_owned(),
+            gap => gap,
+        };
+        c.methods.iter().filter(is).map(|a| format!("{} ({})", title(a.method), gap(a))).collect()
+    };
+    if let Some(floor) = c.best_floor() {
+        let worse = finding(Finding::Worse);
+        let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
+        if !worse.is_empty() {
+            let names = list(worse.iter().map(String::as_str));
+            warn(out, format!("Shown to fall short of the best baseline, {}: {names}.", title(floor)), Vec::new());
+        }
+        if !open.is_empty() {
+            let names = list(open.iter().map(String::as_str));
+            warn(out, format!("Not proved to differ from the best baseline, {}: {names}.", title(floor)), Vec::new());
         }
     }
-    let programs: BTreeSet<&str> = study.runs.iter().map(|r| r.folder.program.as_str()).collect();
-    if programs.len() > 1 {
-        warn(format!("The runs were made by different programs: {}.", list(programs)), Vec::new());
-    }
-    for note in &study.notes {
-        warn(note.clone(), Vec::new());
-    }
-    out
 }

@@ -4,9 +4,10 @@ use maud::{Markup, html};
 use tce_data::Task;
 use tce_diagnosis::{Choice, Diagnosis};
 
-use super::plain;
+use super::numbers::plain;
 use crate::analysis::Analysis;
-use crate::html::{counted, term};
+use crate::html::parts::counted;
+use crate::html::words::term;
 use crate::study::{Study, short};
 use crate::svg::minus;
 

@@ -5,18 +5,20 @@ use maud::{Markup, html};
 use tce_diagnosis::{Choice, Diagnosis};
 
 use crate::analysis::Analysis;
-use crate::html::{counted, document, term};
+use crate::html::parts::{counted, document};
+use crate::html::words::term;
 use crate::study::{Study, order, short};
-use crate::svg::minus;
 
 mod explanation;
 mod figures;
 mod lambda;
+mod numbers;
 mod table;
 
 use explanation::explanation;
 use figures::{copies, coverage, distance, histograms, picture, reliability, theorem};
 use lambda::lambdas;
+use numbers::plain;
 use table::{bounds_table, figures_and_good, implied};
 
 /// The page of one diagnosis.
@@ -59,22 +61,6 @@ pub fn section(study: &Study, analysis: &Analysis) -> Markup {
         }
         (explanation())
     }
-}
-
-fn number(value: f64) -> String {
-    let text = match value.abs() {
-        0.0 => "0".into(),
-        v if v >= 100.0 => format!("{value:.0}"),
-        v if v >= 1.0 => format!("{value:.2}"),
-        v if v >= 0.001 => format!("{value:.3}"),
-        _ => format!("{value:.1e}"),
-    };
-    minus(text)
-}
-
-/// A setting as it was written.
-fn plain(value: f64) -> String {
-    minus(format!("{value}"))
 }
 
 /// What to do with the rows, and with the source's.

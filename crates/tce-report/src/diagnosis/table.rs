@@ -6,8 +6,8 @@ use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{Bounds, Diagnosis, Implied};
 
-use super::{number, plain};
-use crate::html::counted;
+use super::numbers::{number, plain};
+use crate::html::parts::counted;
 use crate::svg::minus;
 
 /// Errors of implied actions in a table.
@@ -38,31 +38,8 @@ type Judged = (String, String, String);
 
 /// Shares and errors, each beside what would be good.
 fn judged(d: &Diagnosis) -> Vec<Judged> {
-    let mut rows: Vec<Judged> = Vec::new();
+    let mut rows = coverage(d);
     let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
-    let second = if d.covered_by_fresh { "other target episodes" } else { "the same target episodes" };
-    let mut bounds = vec![d.y_max];
-    if d.y_max != 0.0 {
-        bounds.push(0.0);
-    }
-    for y in bounds {
-        let Some(c) = d.at(y).and_then(|b| b.coverage) else { continue };
-        let good = d.covered_by_target;
-        row(
-            &format!("Target states reached, y_max = {}", plain(y)),
-            percent(c.target),
-            good.map_or("–".into(), |g| format!("{}, which as many rows of {second} reach", percent(g.target))),
-        );
-        if let Some(source) = c.source {
-            row(
-                &format!("Source states reached, y_max = {}", plain(y)),
-                percent(source),
-                good.and_then(|g| g.source).map_or("–".into(), |s| {
-                    format!("more than {}, which as many rows of {second} reach", percent(s))
-                }),
-            );
-        }
-    }
     if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
         row(
             "Comparisons in which a generated row is nearer to a training row than a real row of another episode is",
@@ -101,6 +78,44 @@ fn judged(d: &Diagnosis) -> Vec<Judged> {
                 .map_or("–".into(), |s| format!("{s:.1}: the target data's")),
         );
     }
+    rows.extend(labels(d));
+    rows
+}
+
+/// How much of both domains generated rows reach.
+fn coverage(d: &Diagnosis) -> Vec<Judged> {
+    let mut rows: Vec<Judged> = Vec::new();
+    let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
+    let second = if d.covered_by_fresh { "other target episodes" } else { "the same target episodes" };
+    let mut bounds = vec![d.y_max];
+    if d.y_max != 0.0 {
+        bounds.push(0.0);
+    }
+    for y in bounds {
+        let Some(c) = d.at(y).and_then(|b| b.coverage) else { continue };
+        let good = d.covered_by_target;
+        row(
+            &format!("Target states reached, y_max = {}", plain(y)),
+            percent(c.target),
+            good.map_or("–".into(), |g| format!("{}, which as many rows of {second} reach", percent(g.target))),
+        );
+        if let Some(source) = c.source {
+            row(
+                &format!("Source states reached, y_max = {}", plain(y)),
+                percent(source),
+                good.and_then(|g| g.source).map_or("–".into(), |s| {
+                    format!("more than {}, which as many rows of {second} reach", percent(s))
+                }),
+            );
+        }
+    }
+    rows
+}
+
+/// Errors of the label models.
+fn labels(d: &Diagnosis) -> Vec<Judged> {
+    let mut rows: Vec<Judged> = Vec::new();
+    let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
     let l = &d.labels;
     for (what, value) in [("action", l.held_out_action), ("reward", l.held_out_reward)] {
         if let Some((error, spread)) = value {

@@ -2,22 +2,23 @@
 
 use std::collections::BTreeSet;
 
-use maud::{DOCTYPE, Markup, PreEscaped, html};
+use maud::{Markup, html};
 
 use crate::analysis::{Analysis, opening};
-use crate::stats::Estimate;
 use crate::study::{Study, shift_title};
-use crate::svg::{Axis, Series, minus};
 
 mod cost;
 mod curves;
 mod findings;
 mod methods;
+pub(crate) mod parts;
 mod runs;
 mod scores;
 mod statistics;
-mod words;
+pub(crate) mod words;
 
+use parts::{classes, estimate, one, percent, range, said, signed, title_cell};
+pub(crate) use parts::{counted, decades, document, duration};
 pub(crate) use words::term;
 
 /// The page's text.
@@ -53,79 +54,6 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
         }
     };
     document(&title, body)
-}
-
-/// A whole page around `body`, with the words that it links to explained at its end.
-pub(crate) fn document(title: &str, body: Markup) -> String {
-    let words = words::list(&body.0);
-    let markup = html! {
-        (DOCTYPE)
-        html lang="en" {
-            head {
-                meta charset="utf-8";
-                meta name="viewport" content="width=device-width, initial-scale=1";
-                // The page promises to need no network: the browser holds it to that.
-                meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'";
-                title { (title) }
-                style { (PreEscaped(include_str!("../page.css"))) }
-            }
-            body {
-                main {
-                    (body)
-                    section id="words" { h2 { "Words" } (words) }
-                    footer class="note" { "Made by " (concat!("tce ", env!("CARGO_PKG_VERSION"))) "." }
-                }
-            }
-        }
-    };
-    markup.into_string()
-}
-
-fn one(value: f64) -> String {
-    minus(format!("{value:.1}"))
-}
-
-fn range(interval: Option<(f64, f64)>, decimals: usize) -> String {
-    interval.map_or_else(String::new, |(low, high)| {
-        minus(format!("[{low:.decimals$}")) + &minus(format!(", {high:.decimals$}]"))
-    })
-}
-
-fn estimate(e: &Estimate, decimals: usize) -> Markup {
-    html! { (minus(format!("{:.decimals$}", e.point))) " " small { (range(e.interval, decimals)) } }
-}
-
-/// With its sign.
-fn signed(value: f64) -> String {
-    if value > 0.0 { format!("+{value:.1}") } else { one(value) }
-}
-
-fn said(e: &Estimate, decimals: usize) -> String {
-    format!("{} {}", minus(format!("{:.decimals$}", e.point)), range(e.interval, decimals)).trim_end().to_owned()
-}
-
-pub(crate) fn counted(n: usize, one: &str, many: &str) -> String {
-    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
-}
-
-/// Colour and dashes of every method: floors are grey.
-fn classes(analysis: &Analysis) -> Vec<Series> {
-    let (mut floors, mut others) = (0, 0);
-    let class = |m: &crate::study::Method| {
-        let (count, letter, hues) = if m.floor { (&mut floors, 'f', 5) } else { (&mut others, 'm', 8) };
-        let k = *count;
-        *count += 1;
-        let again = if k >= hues { " again" } else { "" };
-        Series { title: m.title.clone(), class: format!("{letter}{}{again}", k % hues) }
-    };
-    analysis.methods.iter().map(class).collect()
-}
-
-fn title_cell(analysis: &Analysis, m: usize) -> Markup {
-    html! {
-        (analysis.methods[m].title)
-        @if analysis.needs_mark(m) { " " span class="badge" { "published mode" } }
-    }
 }
 
 fn head(study: &Study, analysis: &Analysis) -> Markup {
@@ -193,29 +121,5 @@ fn warnings(analysis: &Analysis) -> Markup {
                 }
             }
         }
-    }
-}
-
-fn percent(analysis: &Analysis) -> String {
-    format!("{:.0} %", 100.0 * analysis.level)
-}
-
-/// An axis of whole powers of ten.
-pub(crate) fn decades(exponents: impl Iterator<Item = f64>) -> Axis {
-    let (low, high) = exponents.fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
-    let (low, high) = if low > high { (0.0, 1.0) } else { (low.floor(), high.ceil().max(low.floor() + 1.0)) };
-    let step = ((high - low) / 5.0).ceil().max(1.0);
-    let ticks: Vec<f64> = (0..=((high - low) / step) as usize).map(|k| low + k as f64 * step).collect();
-    Axis::fixed(low, high, &ticks)
-}
-
-/// `2 h 05 min`, `18 min`, `42 s`.
-pub(crate) fn duration(seconds: f64) -> String {
-    match seconds {
-        s if s >= 3600.0 => format!("{:.0} h {:02.0} min", (s / 3600.0).floor(), (s % 3600.0 / 60.0).floor()),
-        s if s >= 600.0 => format!("{:.0} min", s / 60.0),
-        s if s >= 60.0 => format!("{:.1} min", s / 60.0),
-        s if s >= 10.0 => format!("{s:.0} s"),
-        s => format!("{s:.1} s"),
     }
 }

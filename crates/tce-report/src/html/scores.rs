@@ -46,22 +46,8 @@ enum Column {
 }
 
 fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
-    let methods = &analysis.methods;
     let papers = t.paper.map_or(&[][..], |p| &p.columns[..]);
-    // The paper's figures for a method stand right beside ours, the rest of the paper behind them.
-    let mut beside: Vec<Column> = Vec::new();
-    let mut used: BTreeSet<usize> = BTreeSet::new();
-    for m in (0..methods.len()).filter(|m| !methods[*m].floor) {
-        beside.push(Column::Ours(m));
-        let name = t.against.iter().find(|a| a.method == m).map(|a| a.paper_method.as_str());
-        let column = name.and_then(|name| t.paper?.column(name)).filter(|c| used.insert(*c));
-        beside.extend(column.map(Column::Paper));
-    }
-    let groups: [(&str, Vec<Column>); 3] = [
-        ("Baselines", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
-        (if used.is_empty() { "Methods" } else { "Methods, ours and the paper's" }, beside),
-        ("Others in the paper", (0..papers.len()).filter(|c| !used.contains(c)).map(Column::Paper).collect()),
-    ];
+    let (groups, used) = groups(analysis, t);
     let columns: Vec<(Column, String)> = groups
         .iter()
         .flat_map(|(_, columns)| columns.iter().enumerate())
@@ -111,26 +97,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                     }
                 }
                 tbody {
-                    @for (r, row) in t.rows.iter().enumerate() {
-                        @let before = r.checked_sub(1).map(|k| t.rows[k].task);
-                        @if before.is_none_or(|b| b.agent != row.task.agent) {
-                            tr class="group" {
-                                th { (agent_title(row.task.agent)) }
-                                @for (_, class) in &columns { td class=(class) {} }
-                            }
-                        }
-                        tr class=[before.is_some_and(|b| b.agent == row.task.agent && b.source != row.task.source).then_some("break")] {
-                            th scope="row" { span class="nb" { (row.task.source) " →" } " " span class="nb" { (row.task.target) } }
-                            @for (c, class) in &columns {
-                                @match *c {
-                                    Column::Ours(m) => (cell(row.cells[m].as_ref(), class)),
-                                    Column::Paper(c) => td class=(class) {
-                                        @match row.paper[c] { None => "–", Some(p) => { (one(p.mean)) small { " ±" (one(p.std)) } } }
-                                    }
-                                }
-                            }
-                        }
-                    }
+                    (rows(t, &columns))
                     tr class="sum" {
                         th scope="row" { "Total" }
                         @for (c, class) in &columns { td class=(class) { (total(*c)) } }
@@ -148,6 +115,63 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                 }
             }
         }
+        (against(analysis, t))
+        @if let Some(paper) = t.paper {
+            @for note in &paper.notes { p class="note" { (note) } }
+        }
+    }
+}
+
+/// The columns by group, and which of the paper's stand beside ours.
+fn groups(analysis: &Analysis, t: &ShiftTable) -> ([(&'static str, Vec<Column>); 3], BTreeSet<usize>) {
+    let methods = &analysis.methods;
+    let papers = t.paper.map_or(&[][..], |p| &p.columns[..]);
+    // The paper's figures for a method stand right beside ours, the rest of the paper behind them.
+    let mut beside: Vec<Column> = Vec::new();
+    let mut used: BTreeSet<usize> = BTreeSet::new();
+    for m in (0..methods.len()).filter(|m| !methods[*m].floor) {
+        beside.push(Column::Ours(m));
+        let name = t.against.iter().find(|a| a.method == m).map(|a| a.paper_method.as_str());
+        let column = name.and_then(|name| t.paper?.column(name)).filter(|c| used.insert(*c));
+        beside.extend(column.map(Column::Paper));
+    }
+    let groups = [
+        ("Baselines", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
+        (if used.is_empty() { "Methods" } else { "Methods, ours and the paper's" }, beside),
+        ("Others in the paper", (0..papers.len()).filter(|c| !used.contains(c)).map(Column::Paper).collect()),
+    ];
+    (groups, used)
+}
+
+/// A row for every task, under the robots' names.
+fn rows(t: &ShiftTable, columns: &[(Column, String)]) -> Markup {
+    html! {
+        @for (r, row) in t.rows.iter().enumerate() {
+            @let before = r.checked_sub(1).map(|k| t.rows[k].task);
+            @if before.is_none_or(|b| b.agent != row.task.agent) {
+                tr class="group" {
+                    th { (agent_title(row.task.agent)) }
+                    @for (_, class) in columns { td class=(class) {} }
+                }
+            }
+            tr class=[before.is_some_and(|b| b.agent == row.task.agent && b.source != row.task.source).then_some("break")] {
+                th scope="row" { span class="nb" { (row.task.source) " →" } " " span class="nb" { (row.task.target) } }
+                @for (c, class) in columns {
+                    @match *c {
+                        Column::Ours(m) => (cell(row.cells[m].as_ref(), class)),
+                        Column::Paper(c) => td class=(class) {
+                            @match row.paper[c] { None => "–", Some(p) => { (one(p.mean)) small { " ±" (one(p.std)) } } }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Our sums beside the paper's.
+fn against(analysis: &Analysis, t: &ShiftTable) -> Markup {
+    html! {
         @if !t.against.is_empty() {
             p class="note" { "Sums over tasks, of a method and of the paper's column of its name, for the tasks that have both:" }
             div class="scroll" {
@@ -171,9 +195,6 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                     }
                 }
             }
-        }
-        @if let Some(paper) = t.paper {
-            @for note in &paper.notes { p class="note" { (note) } }
         }
     }
 }

@@ -3,8 +3,8 @@
 use maud::{Markup, html};
 
 use super::{classes, percent, term};
-use crate::analysis::{Aggregate, Analysis};
-use crate::svg::{self, Axis, Frame, Interval, Line, Point};
+use crate::analysis::{Aggregate, Analysis, Comparison};
+use crate::svg::{self, Axis, Frame, Interval, Line, Point, Series};
 
 pub(super) fn statistics(analysis: &Analysis) -> Markup {
     let Some(c) = &analysis.comparison else { return html! { p { "No run has a score." } } };
@@ -37,22 +37,7 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
             Some(Interval { series: series[a.method].clone(), inner, outer: None })
         })
         .collect();
-    let profile: Vec<Line> = c
-        .methods
-        .iter()
-        .map(|a| Line {
-            series: series[a.method].clone(),
-            points: c
-                .thresholds
-                .iter()
-                .zip(&a.profile)
-                .map(|(t, e)| {
-                    let band = e.interval.map(|(l, h)| (100.0 * l, 100.0 * h));
-                    Point { x: *t, y: 100.0 * e.point, band }
-                })
-                .collect(),
-        })
-        .collect();
+    let profile = profiles(c, &series);
     let ends = [c.thresholds[0], c.thresholds[c.thresholds.len() - 1]];
     html! {
         p {
@@ -97,4 +82,21 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
             }
         }
     }
+}
+
+/// For every method, the share of runs above each threshold.
+fn profiles(c: &Comparison, series: &[Series]) -> Vec<Line> {
+    let line = |a: &Aggregate| Line {
+        series: series[a.method].clone(),
+        points: c
+            .thresholds
+            .iter()
+            .zip(&a.profile)
+            .map(|(t, e)| {
+                let band = e.interval.map(|(l, h)| (100.0 * l, 100.0 * h));
+                Point { x: *t, y: 100.0 * e.point, band }
+            })
+            .collect(),
+    };
+    c.methods.iter().map(line).collect()
 }

@@ -5,8 +5,6 @@ use tce_data::Agent;
 use crate::models::inertia::{dot, minus};
 use crate::models::robot::Vec3;
 
-use super::scene::Floor;
-
 /// `a + t b`.
 pub(super) fn along(a: Vec3, t: f64, b: Vec3) -> Vec3 {
     std::array::from_fn(|i| a[i] + t * b[i])
@@ -80,6 +78,15 @@ impl Camera {
     pub fn scale(&self, depth: f64) -> f64 {
         self.focal / depth
     }
+}
+
+/// The pattern of the ground.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Floor {
+    /// Side of a square, m.
+    pub square: f64,
+    /// Depth from which on it fades into the sky, m.
+    pub fade: f64,
 }
 
 /// How an agent is looked at.

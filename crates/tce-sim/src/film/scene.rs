@@ -7,7 +7,7 @@
 use crate::models::inertia::{dot, minus};
 use crate::models::robot::Vec3;
 
-use super::camera::{Camera, along, unit};
+use super::camera::{Camera, Floor, along, unit};
 use super::picture::{Colour, Picture, mix};
 use super::solid::{Paint, Solid};
 
@@ -35,15 +35,6 @@ pub(super) fn colour(paint: Paint) -> Colour {
         Paint::Left => [20, 170, 130],
         Paint::Changed => [235, 105, 30],
     }
-}
-
-/// The pattern of the ground.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Floor {
-    /// Side of a square, m.
-    pub square: f64,
-    /// Depth from which on it fades into the sky, m.
-    pub fade: f64,
 }
 
 /// Draws `solids` as `camera` sees them.

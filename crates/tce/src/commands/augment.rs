@@ -7,14 +7,14 @@ use clap::Args;
 use serde::Serialize;
 use tce_data::Transitions;
 use tce_nn::Device;
+use tce_run::course::Course;
+use tce_run::error::Result;
+use tce_run::expand::{Generated, expand};
+use tce_run::inputs::Inputs;
+use tce_run::layers::ConfigArgs;
+use tce_run::own::{Own, Writing};
 
-use crate::course::Course;
-use crate::error::Result;
-use crate::expand::{Generated, expand};
-use crate::inputs::Inputs;
-use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::own::{Own, Writing};
 
 /// Arguments of `augment`.
 #[derive(Debug, Args)]
@@ -55,10 +55,10 @@ struct Augmented {
 impl Augment {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        super::refuse_existing(&self.out, self.writing.force)?;
-        super::refuse_inputs(&self.out, &[&self.source, &self.target])?;
+        super::refuse::existing(&self.out, self.writing.force)?;
+        super::refuse::inputs_as_output(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
-        super::refuse_folder(&self.cache)?;
+        super::refuse::folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
@@ -85,7 +85,7 @@ impl Augment {
             ("target_sha256".to_owned(), inputs.target.hash.clone()),
             ("seed".to_owned(), self.seed.to_string()),
             ("config".to_owned(), config.to_toml()),
-            ("program".to_owned(), crate::PROGRAM.to_owned()),
+            ("program".to_owned(), tce_base::PROGRAM.to_owned()),
         ]);
         self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };

@@ -4,16 +4,15 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_augment::config::Length;
 use tce_base::{set_quiet, write_json};
-
 use tce_nn::Device;
+use tce_run::error::{Error, Result};
+use tce_run::layers::{Layered, Preset};
+use tce_run::processor::Processor;
 
 use crate::bench::{Measured, On, measure, names, simulates};
-use crate::config::Length;
-use crate::error::{Error, Result};
-use crate::layers::{Layered, Preset};
 use crate::output::{Output, table};
-use crate::processor::Processor;
 
 /// Arguments of `bench`.
 #[derive(Debug, Args)]
@@ -84,7 +83,7 @@ impl Bench {
             core_gflops = core_gflops.max(tce_nn::product_rate(0.05));
         }
         let report = Report {
-            program: crate::PROGRAM.to_owned(),
+            program: tce_base::PROGRAM.to_owned(),
             processor: processor(),
             device: kind,
             seeds: self.seeds,

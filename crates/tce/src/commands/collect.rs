@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, parse_environment, reference_scores, save_d4rl};
+use tce_run::error::{Error, Result};
+use tce_run::inputs::d4rl_recipe;
 use tce_sim::EPISODE_LIMIT;
+use tce_zoo::exhibits;
+use tce_zoo::recipes::{Part, Recipe};
 
-use crate::actors::{Part, Recipe};
-use crate::error::{Error, Result};
-use crate::inputs::d4rl_recipe;
 use crate::output::{Output, table};
-use crate::zoo;
 
 /// Arguments of `collect`.
 #[derive(Debug, Args)]
@@ -58,7 +58,7 @@ struct Collected {
 impl Collect {
     /// Runs the command.
     pub fn run(self, output: Output) -> Result<()> {
-        super::refuse_existing(&self.out, self.force)?;
+        super::refuse::existing(&self.out, self.force)?;
         if self.rows == 0 || self.lanes == 0 {
             return Err(Error::Usage("--rows and --lanes must be at least 1".into()));
         }
@@ -69,7 +69,7 @@ impl Collect {
                 let recipe = if shift == Shift::Source {
                     d4rl_recipe(agent, quality, self.rows, self.seed, false)?
                 } else {
-                    let recipe = zoo::cast(agent, shift)?.source(agent, shift, quality, self.rows, self.seed);
+                    let recipe = exhibits::cast(agent, shift)?.source(agent, shift, quality, self.rows, self.seed);
                     recipe.ok_or_else(|| {
                         let message = "the zoo has no actors for this quality there; name some with --actor";
                         Error::Usage(format!("{agent}-{shift}: {message}"))

@@ -2,8 +2,7 @@
 
 use clap::Args;
 use clap_complete::Shell;
-
-use crate::error::Result;
+use tce_run::error::Result;
 
 /// Arguments of `completions`.
 #[derive(Debug, Args)]
@@ -15,9 +14,9 @@ pub struct Completions {
 
 impl Completions {
     /// Prints the script.
-    pub fn run(self) -> Result<()> {
+    pub fn run(self, mut command: clap::Command) -> Result<()> {
         let mut script = Vec::new();
-        clap_complete::generate(self.shell, &mut super::help::command(), "tce", &mut script);
+        clap_complete::generate(self.shell, &mut command, "tce", &mut script);
         // A closed pipe is not an error of the command.
         let _ = std::io::Write::write_all(&mut std::io::stdout(), &script);
         Ok(())

@@ -3,12 +3,12 @@
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_data::Task;
+use tce_run::error::{Error, Result};
+use tce_run::keys::{Explanation, explain, presets, schema, table as table_of};
+use tce_run::layers::ConfigArgs;
+use tce_run::variant::Variant;
 
-use crate::error::{Error, Result};
-use crate::keys::{Explanation, explain, presets, schema, table as table_of};
-use crate::layers::ConfigArgs;
 use crate::output::{Output, heading, list, table};
-use crate::variant::Variant;
 
 /// Show the configuration.
 #[derive(Debug, Subcommand)]

@@ -8,11 +8,11 @@ use tce_data::{
     ActionRange, Agent, Check, EpisodeEnds, Finding, Inspection, LoadOptions, LoadReport, Loaded, Problem, Quality,
     ScoreTable, Severity, Shift, Transitions, infer_agents, load, read_attributes, reference_scores,
 };
+use tce_run::error::{Error, Result};
+use tce_run::own::{DataFormat, Own, Writing, range_of};
 use tce_sim::{ReplayReport, replay};
 
-use crate::error::{Error, Result};
 use crate::output::{Output, table};
-use crate::own::{DataFormat, Own, Writing, range_of};
 
 /// Look at, check and convert data sets.
 #[derive(Debug, Subcommand)]
@@ -64,20 +64,18 @@ pub struct Convert {
     own: Own,
 }
 
-impl Own {
-    /// Reads a file; where the user does not name its robot, a public file's name does, if the dimensions agree.
-    fn read(&self, file: &Path) -> Result<(Own, Loaded)> {
-        self.read_with(file, Own::load_options)
-    }
+/// Reads a file; where the user does not name its robot, a public file's name does, if the dimensions agree.
+fn read(own: &Own, file: &Path) -> Result<(Own, Loaded)> {
+    read_with(own, file, Own::load_options)
+}
 
-    fn read_with(&self, file: &Path, options: impl Fn(&Own) -> LoadOptions) -> Result<(Own, Loaded)> {
-        let named = Own { env: self.env.or_else(|| environment_of(file)), ..self.clone() };
-        match load(file, &options(&named)) {
-            Err(e) if self.env.is_none() && e.problem() == Some(Problem::Dimension) => {
-                Ok((self.clone(), load(file, &options(self))?))
-            }
-            loaded => Ok((named, loaded?)),
+fn read_with(own: &Own, file: &Path, options: impl Fn(&Own) -> LoadOptions) -> Result<(Own, Loaded)> {
+    let named = Own { env: own.env.or_else(|| environment_of(file)), ..own.clone() };
+    match load(file, &options(&named)) {
+        Err(e) if own.env.is_none() && e.problem() == Some(Problem::Dimension) => {
+            Ok((own.clone(), load(file, &options(own))?))
         }
+        loaded => Ok((named, loaded?)),
     }
 }
 
@@ -127,7 +125,7 @@ impl Inspect {
     fn run(self, output: Output) -> Result<()> {
         let mut all = Vec::new();
         for file in &self.files {
-            let (own, Loaded { transitions, report, .. }) = self.own.read(file)?;
+            let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
             let content = tce_data::inspect(&transitions, own.limit());
             let environment = own.env;
             let reference = environment.and_then(|(a, s)| reference_scores(a, s, ScoreTable::default()));
@@ -250,7 +248,7 @@ impl CheckArgs {
         }
         let mut all = Vec::new();
         for file in &self.files {
-            let (own, Loaded { transitions, report, .. }) = self.own.read(file)?;
+            let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
             let environment = own.env;
             let mut check = tce_data::check(&transitions, own.agent());
             if let Some(given) = &own.action_range {
@@ -373,9 +371,9 @@ fn render_checks(all: &[Checked]) -> String {
 
 impl Convert {
     fn run(self, output: Output) -> Result<()> {
-        super::refuse_existing(&self.output, self.writing.force)?;
+        super::refuse::existing(&self.output, self.writing.force)?;
         let options = |own: &Own| LoadOptions { all_columns: true, ..own.load_options() };
-        let Loaded { transitions, columns, mut report } = self.own.read_with(&self.input, options)?.1;
+        let Loaded { transitions, columns, mut report } = read_with(&self.own, &self.input, options)?.1;
         let kept: Vec<(&str, &[f32])> =
             columns.iter().map(|(name, values)| (name.as_str(), values.as_slice())).collect();
         if self.writing.format == DataFormat::Minari && !kept.is_empty() {

@@ -1,8 +1,6 @@
 //! What `--help` says besides the options: commands in groups, and examples.
 
-use clap::{Command, CommandFactory};
-
-use super::Cli;
+use clap::Command;
 
 /// All commands, in groups, in the order in which a reader wants them.
 const GROUPS: [(&str, &[&str]); 6] = [
@@ -196,9 +194,8 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     ("man", &[("all pages", "tce man --out ~/.local/share/man/man1")]),
 ];
 
-/// clap's command with groups and examples.
-pub fn command() -> Command {
-    let mut command = Cli::command();
+/// `command` with groups and examples.
+pub fn described(mut command: Command) -> Command {
     let groups = groups(&command);
     let (on, off) = styles(&command);
     for (path, examples) in EXAMPLES {
@@ -261,7 +258,14 @@ fn at(command: Command, path: &[&str], change: &dyn Fn(Command) -> Command) -> C
 
 #[cfg(test)]
 mod tests {
+    use clap::CommandFactory;
+
     use super::*;
+    use crate::Cli;
+
+    fn command() -> Command {
+        described(Cli::command())
+    }
 
     /// The words of a line, as a shell makes them; what goes into a file is the shell's.
     fn words(line: &str) -> Vec<String> {

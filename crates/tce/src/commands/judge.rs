@@ -6,12 +6,12 @@ use clap::Args;
 use serde::Serialize;
 use tce_learn::{DynamicsConfig, FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
+use tce_run::error::{Error, Result};
+use tce_run::inputs::Inputs;
+use tce_run::judge::{Judge, Judged};
+use tce_run::own::Own;
 
-use crate::error::{Error, Result};
-use crate::inputs::Inputs;
-use crate::judge::{Judge, Judged};
 use crate::output::{Output, table};
-use crate::own::Own;
 
 /// Arguments of `judge`.
 #[derive(Debug, Args)]

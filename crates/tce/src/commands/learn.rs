@@ -5,24 +5,25 @@ use std::sync::Arc;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use tce_base::{read_if_there, sha256_hex};
+use tce_base::{plus_minus, read_if_there, sha256_hex};
 use tce_data::ScoreTable;
+use tce_learn::{About, OtherRows};
 use tce_nn::Device;
+use tce_run::config::{Algorithm, Config, LearnerConfig};
+use tce_run::course::{Course, learning};
+use tce_run::error::{Error, Result};
+use tce_run::inputs::{Inputs, Table};
+use tce_run::judge::Judge;
+use tce_run::layers::ConfigArgs;
+use tce_run::learning::{Learned, MemberData, learn, save_policies};
+use tce_run::methods::row_scores;
+use tce_run::own::Own;
+use tce_run::pipeline::seeds;
+use tce_run::processor::Processor;
+use tce_run::verdict::{Candidate, Kept, keep, only, recommend};
+use tce_zoo::actors::Arena;
 
-use crate::actors::Arena;
-use crate::config::{Algorithm, Config, LearnerConfig};
-use crate::course::{Course, learning};
-use crate::error::{Error, Result};
-use crate::inputs::{Inputs, Table};
-use crate::judge::Judge;
-use crate::layers::ConfigArgs;
-use crate::learning::{Learned, MemberData, learn, save_policies};
-use crate::methods::{Method, row_scores};
-use crate::output::{Output, list as listed, plus_minus, table};
-use crate::own::Own;
-use crate::pipeline::seeds;
-use crate::processor::Processor;
-use crate::verdict::{Candidate, Kept, keep, only, recommend};
+use crate::output::{Output, list as listed, table};
 
 /// Arguments of `learn`.
 #[derive(Debug, Args)]
@@ -82,48 +83,31 @@ impl Learn {
     pub fn run(mut self, output: Output, device: &Device) -> Result<()> {
         // clap asks for the files unless the list is wanted.
         let (Some(target_file), Some(out)) = (self.target.take(), self.out.take()) else {
-            output.print(&Algorithm::ALL.map(Algorithm::method), list);
+            let all: Vec<About> = Algorithm::ALL.iter().map(|a| a.about()).collect();
+            output.print(&all, |all| list(all));
             return Ok(());
         };
         self.config = self.config.with_learner(self.learner);
         self.config.sets.extend(self.top.map(|top| format!("learner.top={top:?}")));
-        if self.learner == Some(Algorithm::Dmc) {
+        if self.learner.is_some_and(|learner| learner.about().needs == OtherRows::Scored) {
             // The rows are in the files here; without scores of their own they are scored as source rows are.
             self.config.sets.splice(0..0, ["mixture.generated=none".to_owned(), "mixture.source=all".to_owned()]);
         }
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        let method = config.learner.algorithm.method();
-        if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
-            return Err(Error::Usage(format!(
-                "--top: found --learner {}, expected bc, whose option it is",
-                method.name
-            )));
-        }
-        if self.extra.is_none() && method.needs == crate::methods::SOURCE_ROWS {
-            return Err(Error::Usage(format!(
-                "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
-                method.name
-            )));
-        }
-        super::refuse_folder(&out)?;
+        let method = config.learner.algorithm.about();
+        self.refuse_what_does_not_fit(&config)?;
+        super::refuse::folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target_file, self.extra.as_deref(), &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         inputs.ensure_episodes(&config.learner)?;
-        let complete = !config.learner.algorithm.looks_at_successors();
+        let complete = !config.learner.algorithm.about().successors;
         let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
         let (target, extra) = (rows(&inputs.target), inputs.extra.as_ref().map(rows));
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
-        let mut spec = serde_json::json!({
-            "program": env!("CARGO_PKG_VERSION"), "config": &config, "seeds": &seeds, "own": &self.own, "actions": &inputs.actions,
-            "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
-        });
-        if let Some(source) = &inputs.source {
-            spec["source"] = source.hash.clone().into();
-        }
-        Processor::from(device).sign(&mut spec);
+        let spec = self.spec(&config, &seeds, &inputs, device);
         let key = sha256_hex(spec.to_string().as_bytes());
         let place = (out.as_path(), key.as_str());
         if let Some(report) = found(&out, &spec)? {
@@ -177,12 +161,43 @@ impl Learn {
 }
 
 impl Learn {
+    /// Refuses options and files that the learner has no use for, or that it lacks.
+    fn refuse_what_does_not_fit(&self, config: &Config) -> Result<()> {
+        let method = config.learner.algorithm.about();
+        if self.top.is_some() && config.learner.algorithm != Algorithm::Bc {
+            return Err(Error::Usage(format!(
+                "--top: found --learner {}, expected bc, whose option it is",
+                method.name
+            )));
+        }
+        if self.extra.is_none() && method.needs == OtherRows::Source {
+            return Err(Error::Usage(format!(
+                "--learner {}: found target rows alone, expected source rows as well; give them with --extra FILE",
+                method.name
+            )));
+        }
+        Ok(())
+    }
+
+    /// What decides the result.
+    fn spec(&self, config: &Config, seeds: &[u64], inputs: &Inputs, device: &Device) -> serde_json::Value {
+        let mut spec = serde_json::json!({
+            "program": env!("CARGO_PKG_VERSION"), "config": config, "seeds": seeds, "own": &self.own, "actions": &inputs.actions,
+            "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
+        });
+        if let Some(source) = &inputs.source {
+            spec["source"] = source.hash.clone().into();
+        }
+        Processor::from(device).sign(&mut spec);
+        spec
+    }
+
     /// Tells the steps that are to come.
     fn plan(&self, config: &Config, inputs: &Inputs, seeds: usize, out: &Path, device: &Device) {
         let rows = &inputs.target.rows;
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, out);
         let mixed = inputs.extra.is_some();
-        course.learning(config.learner.algorithm.method().name, config, mixed);
+        course.learning(config.learner.algorithm.about().name, config, mixed);
         if !self.no_verdict {
             if mixed {
                 course.learning(FLOOR, &Config { learner: floor_learner(config), ..config.clone() }, false);
@@ -297,10 +312,10 @@ fn render(report: &Report) -> String {
     text
 }
 
-fn list(methods: &[Method; Algorithm::ALL.len()]) -> String {
+fn list(methods: &[About]) -> String {
     let rows = methods.iter().map(|m| {
         let modes = m.published.map_or_else(String::new, |what| format!("published: {what}"));
-        [m.name, m.description, m.reference, m.needs].map(str::to_owned).into_iter().chain([modes]).collect::<Vec<_>>()
+        [m.name, m.description, m.reference, &m.needs.to_string(), &modes].map(str::to_owned)
     });
     let text =
         listed(&["learner", "what it is", "reference", "besides target rows", "mode (default: corrected)"], rows);

@@ -4,8 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use tce_base::{FileError, write_atomically};
-
-use crate::error::Result;
+use tce_run::error::Result;
 
 /// Arguments of `man`.
 #[derive(Debug, Args)]
@@ -17,9 +16,9 @@ pub struct Man {
 
 impl Man {
     /// Writes a page for every command.
-    pub fn run(self) -> Result<()> {
+    pub fn run(self, command: clap::Command) -> Result<()> {
         std::fs::create_dir_all(&self.out).map_err(|e| FileError::new(&self.out, "create the directory", e))?;
-        let mut command = super::help::command().disable_help_subcommand(true);
+        let mut command = command.disable_help_subcommand(true);
         command.build();
         self.page(command, "tce")
     }

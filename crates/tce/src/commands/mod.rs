@@ -1,13 +1,10 @@
 //! The command line: one file a command.
 
-use std::path::Path;
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use tce_run::error::{Error, Result};
+use tce_run::processor::Processor;
 
-use clap::{FromArgMatches, Parser, Subcommand};
-use tce_base::{ensure_folder, ensure_writable};
-
-use crate::error::{Error, Result};
 use crate::output::{Form, Output};
-use crate::processor::Processor;
 
 mod augment;
 mod bench;
@@ -21,6 +18,7 @@ mod help;
 mod judge;
 mod learn;
 mod man;
+mod refuse;
 mod report;
 mod run;
 mod sweep;
@@ -92,9 +90,14 @@ enum Command {
 }
 
 impl Cli {
+    /// clap's command with groups and examples.
+    fn described() -> clap::Command {
+        help::described(Self::command())
+    }
+
     /// What the user asked for. Help, versions and wrong calls end the process here, by clap's own hand: a wrong call with exit code 2.
     pub fn of_command_line() -> Self {
-        let matches = help::command().get_matches();
+        let matches = Self::described().get_matches();
         Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
     }
 
@@ -134,45 +137,8 @@ impl Cli {
             Command::Sweep(command) => command.run(output, self.save_every, self.device),
             Command::Report(args) => args.run(output),
             Command::Bench(args) => args.run(output, self.device, &device()?),
-            Command::Completions(args) => args.run(),
-            Command::Man(args) => args.run(),
+            Command::Completions(args) => args.run(Self::described()),
+            Command::Man(args) => args.run(Self::described()),
         }
     }
-}
-
-/// Refuses a folder for results that cannot be written, or that lies in a sweep's, whose files are all accounted for.
-fn refuse_folder(out: &Path) -> Result<()> {
-    match crate::sweep::around(&out.join("x")) {
-        Some(sweep) => Err(Error::Usage(format!(
-            "--out {}: found the folder of a sweep, {}; what lies there is the sweep's own. Choose another folder",
-            out.display(),
-            sweep.display()
-        ))),
-        None => Ok(ensure_folder(out)?),
-    }
-}
-
-/// Refuses to write over what is read.
-fn refuse_inputs(out: &Path, inputs: &[&Path]) -> Result<()> {
-    let same = |input: &&&Path| out.canonicalize().is_ok_and(|out| input.canonicalize().is_ok_and(|i| i == out));
-    match inputs.iter().find(same) {
-        Some(input) => Err(Error::Usage(format!(
-            "--out {}: found one of the inputs, {}; choose another name",
-            out.display(),
-            input.display()
-        ))),
-        None => Ok(()),
-    }
-}
-
-/// An output that exists is only replaced when the user says so.
-fn refuse_existing(path: &Path, force: bool) -> Result<()> {
-    ensure_writable(path)?;
-    if path.exists() && !force {
-        return Err(Error::Usage(format!(
-            "{} exists; choose another name, or say --force to replace it",
-            path.display()
-        )));
-    }
-    Ok(())
 }

@@ -6,10 +6,10 @@ use clap::Args;
 use serde::Serialize;
 use tce_report::analysis::{Aggregate, Comparison, opening};
 use tce_report::{Analysis, Options, analyse};
+use tce_run::error::{Error, Result};
+use tce_run::study::of_directory;
 
-use crate::error::{Error, Result};
 use crate::output::{Output, prose, table};
-use crate::study::of_directory;
 
 /// Arguments of `report`.
 #[derive(Debug, Args)]

@@ -2,21 +2,22 @@
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::plus_minus;
 use tce_data::Task;
 use tce_learn::{DynamicsConfig, LabelErrors};
 use tce_nn::Device;
+use tce_run::config::{Algorithm, Config, GeneratedRows, SourceRows};
+use tce_run::course::Course;
+use tce_run::error::{Error, Result};
+use tce_run::inputs::{Behaviour, DataArgs, Inputs};
+use tce_run::judge::Judge;
+use tce_run::layers::ConfigArgs;
+use tce_run::pipeline::{Summary, run, seeds};
+use tce_run::variant::Variant;
+use tce_run::verdict::{Candidate, Kept, keep, only, recommend};
 
 use crate::conclusion::{self, Scored};
-use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
-use crate::course::Course;
-use crate::error::{Error, Result};
-use crate::inputs::{Behaviour, DataArgs, Inputs};
-use crate::judge::Judge;
-use crate::layers::ConfigArgs;
-use crate::output::{Output, heading, mark_best, plus_minus, table};
-use crate::pipeline::{Summary, run, seeds};
-use crate::variant::Variant;
-use crate::verdict::{Candidate, Kept, keep, only, recommend};
+use crate::output::{Output, heading, mark_best, table};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
@@ -76,7 +77,7 @@ impl Run {
         if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::FLOORS.contains(v))) {
             return Err(Error::Usage(format!(
                 "--learner {}: found floors alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
-                learner.method().name,
+                learner.about().name,
                 self.variant.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
             )));
         }
@@ -95,7 +96,7 @@ impl Run {
             })
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        super::refuse_folder(&self.data.out)?;
+        super::refuse::folder(&self.data.out)?;
         tce_sim::open_library()?;
         // One loading for all: the methods differ in nothing that decides their data, apart from whether they look at the source.
         let widest = configs.iter().find(|c| c.needs_source()).unwrap_or(&configs[0]);
@@ -189,7 +190,7 @@ fn render(report: &Report) -> String {
     let header = ["method", "score", "return", "seeds", "other rows", "time"];
     let mut text = format!("{}\n{}\n", heading(&report.task.to_string()), table(&header, lines));
     let generated = report.rows.iter().filter(|r| !r.summary.generated.is_empty()).map(|r| {
-        let mean = |f: &dyn Fn(&crate::expand::Generated) -> f64| {
+        let mean = |f: &dyn Fn(&tce_run::expand::Generated) -> f64| {
             r.summary.generated.iter().map(f).sum::<f64>() / r.summary.generated.len() as f64
         };
         // Where the generator makes whole transitions there are no label models.

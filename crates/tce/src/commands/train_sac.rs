@@ -8,9 +8,9 @@ use serde::Serialize;
 use tce_data::{Agent, Shift, parse_environment, save_d4rl};
 use tce_learn::sac::SacConfig;
 use tce_nn::{Device, on_threads_of};
+use tce_run::error::{Error, Result};
+use tce_zoo::sac_training::{Goal, Ledger, Settings, Training};
 
-use crate::acting::{Goal, Ledger, Settings, Training};
-use crate::error::{Error, Result};
 use crate::output::{Output, table};
 
 /// Steps of a training before the next one's turn.
@@ -108,7 +108,7 @@ impl TrainSac {
         if !(0.0..=1.0).contains(&self.explore) {
             return Err(Error::Usage(format!("--explore {}: expected a share from 0 to 1", self.explore)));
         }
-        super::refuse_folder(&self.out)?;
+        super::refuse::folder(&self.out)?;
         let goal = Goal {
             steps: self.steps,
             until: self.until_score,
@@ -157,7 +157,7 @@ impl TrainSac {
             on_threads_of(device, || {
                 trainings.par_iter_mut().zip(&mut faults).for_each(|(t, fault)| {
                     if fault.is_none() {
-                        *fault = t.3.advance(TURN).err();
+                        *fault = t.3.advance(TURN).err().map(Error::from);
                     }
                 });
             });

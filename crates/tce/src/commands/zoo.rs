@@ -4,15 +4,15 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use tce_base::{Streams, interrupted, write_atomically};
+use tce_base::{Streams, interrupted, mean_std, write_atomically};
 use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
+use tce_run::error::{Error, Result};
+use tce_zoo::actors::{Arena, Evaluation, evaluate};
+use tce_zoo::exhibits::{Card, Exhibit};
 
-use crate::actors::{Arena, Evaluation, evaluate};
-use crate::error::{Error, Result};
-use crate::output::{Output, mean_std, table};
-use crate::zoo::{Card, Exhibit};
+use crate::output::{Output, table};
 
 /// The commands of `zoo`. To collect rows: `tce collect --env hopper --actor zoo:hopper-source-medium`.
 #[derive(Debug, Subcommand)]
@@ -77,7 +77,7 @@ pub struct Keep {
     #[arg(long, default_value_t = 100)]
     episodes: usize,
     /// The folder of the zoo.
-    #[arg(long, default_value = "crates/tce/zoo")]
+    #[arg(long, default_value = "crates/tce-zoo/zoo")]
     out: PathBuf,
     /// Replace an actor that is there.
     #[arg(long)]
@@ -182,7 +182,7 @@ impl Rollout {
         let exhibits = if self.names.is_empty() {
             Exhibit::all()
         } else {
-            self.names.iter().map(|n| Exhibit::find(n)).collect::<Result<_>>()?
+            self.names.iter().map(|n| Exhibit::find(n)).collect::<tce_zoo::Result<_>>()?
         };
         let mut all = Vec::new();
         for exhibit in exhibits {
@@ -209,7 +209,8 @@ impl Rollout {
 }
 
 fn judge(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
-    evaluate(policy, Arena::new(card.agent, card.shift, ScoreTable::default()), episodes, streams, mean, interrupted)
+    let arena = Arena::new(card.agent, card.shift, ScoreTable::default());
+    Ok(evaluate(policy, arena, episodes, streams, mean, interrupted)?)
 }
 
 impl Keep {
@@ -255,7 +256,7 @@ impl Keep {
         card.attach(&mut parameters);
         let name = card.name().expect("it has a role");
         let path = self.out.join(format!("{name}.safetensors"));
-        super::refuse_existing(&path, self.force)?;
+        super::refuse::existing(&path, self.force)?;
         let bytes = parameters.to_half_bytes();
         write_atomically(&path, &bytes)?;
         let shown = Shown { name, bytes: bytes.len(), sha256: tce_base::sha256_hex(&bytes), card };

@@ -2,7 +2,7 @@
 
 use std::io::Result;
 
-use super::table::{Fields, Image, MAX_READ, malformed};
+use super::image::{Fields, Image, MAX_READ, malformed};
 
 /// Records of one index: far more links than a group of a file of transitions has.
 const MAX_RECORDS: u64 = 1 << 20;

@@ -5,6 +5,7 @@
 //! ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
 
 mod heap;
+mod image;
 mod modern;
 mod names;
 mod numbers;

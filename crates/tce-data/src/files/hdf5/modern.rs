@@ -15,7 +15,7 @@ use std::sync::{Mutex, PoisonError};
 
 use hdf5_pure::{Error, File, FormatError, Source};
 
-use super::table::Patch;
+use super::image::Patch;
 
 /// Opens the file with `patch` in its place.
 pub(super) fn open(path: &Path, bytes: u64, patch: Patch) -> Result<File, Error> {

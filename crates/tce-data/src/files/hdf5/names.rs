@@ -6,7 +6,8 @@ use std::path::Path;
 
 use hdf5_pure::Superblock;
 
-use super::table::{Image, Link, Links, Patch, malformed};
+use super::image::{Image, Patch, malformed};
+use super::table::{Link, Links};
 
 /// Soft links that one name may lead through: HDF5's own default.
 const MAX_LINKS: usize = 16;

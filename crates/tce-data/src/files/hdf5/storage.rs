@@ -19,6 +19,24 @@ pub(super) enum Unwritten {
     Fill,
 }
 
+/// What a data set says of itself.
+struct Told<'a> {
+    name: &'a str,
+    shape: Vec<u64>,
+    /// Bytes of an element.
+    element: u64,
+    /// Bytes of all; None above 2^64.
+    announced: Option<u64>,
+    /// Whether the file can hold them, compressed.
+    fits: bool,
+    unwritten: Unwritten,
+}
+
+/// Bytes of a box of elements; None above 2^64.
+fn bytes_of(element: u64, dims: &[u64]) -> Option<u64> {
+    dims.iter().try_fold(element, |n, &d| n.checked_mul(d))
+}
+
 impl Hdf5 {
     /// Refuses a data set that the file's bytes cannot hold, that was never (completely) written, or that is stored in a
     /// way that is not read. Returns a note about what will be filled, if anything.
@@ -29,17 +47,88 @@ impl Hdf5 {
         unwritten: Unwritten,
     ) -> Result<Option<String>, DataError> {
         let (shape, element) = guard(&self.path, name, || Ok((dataset.shape()?, dataset.element_size()?)))?;
-        let bytes_of = |dims: &[u64]| dims.iter().try_fold(element, |n, &d| n.checked_mul(d));
-        let oversized = |announced: Option<u64>| {
-            let announced = announced.map_or("more than 2^64".to_owned(), |n| n.to_string());
-            let found = format!("{announced} bytes announced, in a file of {} bytes", self.bytes);
-            self.invalid(Problem::Oversized, name, found, "no more data than the file can hold", REPAIR)
-        };
-        let announced = bytes_of(&shape);
+        let announced = bytes_of(element, &shape);
         let fits = announced.is_some_and(|n| n <= self.bytes.saturating_mul(MAX_EXPANSION));
-        // What is missing is filled or refused.
-        let missing = |what: String| match unwritten {
-            Unwritten::Refuse if !fits => Err(oversized(announced)),
+        let told = Told { name, shape, element, announced, fits, unwritten };
+        match guard(&self.path, name, || dataset.layout())? {
+            Layout::Contiguous { address: None, .. } => {
+                // Data in a file of its own looks the same, except to a reader.
+                match guard(&self.path, name, || Ok(dataset.read_raw_rows(0, 1)))? {
+                    Err(Error::Format(FormatError::UnsupportedExternalStorage)) => {
+                        Err(self.elsewhere(name, "raw data in another file"))
+                    }
+                    _ => self.filled_or_refused(&told, "created, but never written".into()),
+                }
+            }
+            Layout::Contiguous { .. } | Layout::Compact { .. } if announced.is_none_or(|n| n > self.bytes) => {
+                Err(self.oversized(name, announced))
+            }
+            Layout::Chunked { index: ChunkIndex::BTreeV2, .. } => {
+                let found = "chunks under a version 2 B-tree (several unlimited dimensions, libver=\"latest\")";
+                let advice = format!("Store it anew: {COPY}");
+                Err(self.invalid(Problem::Unsupported, name, found, "at most one unlimited dimension", advice))
+            }
+            Layout::Chunked { chunk_shape, .. } => self.ensure_chunks(&told, dataset, &chunk_shape),
+            Layout::Virtual => Err(self.elsewhere(name, "a virtual data set")),
+            _ => Ok(None),
+        }
+    }
+
+    /// [`Self::ensure_stored`] of a data set in chunks.
+    fn ensure_chunks(
+        &self,
+        told: &Told<'_>,
+        dataset: &Dataset,
+        chunk_shape: &[u64],
+    ) -> Result<Option<String>, DataError> {
+        let Told { name, shape, element, announced, fits, .. } = told;
+        let chunk = bytes_of(*element, chunk_shape);
+        if chunk_shape.contains(&0) || chunk_shape.len() != shape.len() {
+            return Err(self.oversized(name, chunk));
+        }
+        let grid = shape.iter().zip(chunk_shape).try_fold(1u64, |n, (s, c)| n.checked_mul(s.div_ceil(*c)));
+        let grid = grid.ok_or_else(|| self.oversized(name, None))?;
+        // Every stored chunk costs an address or, where the index has none, an element: the others are missing.
+        let mut note = None;
+        if grid > self.bytes / element.clamp(&1, &8) {
+            note = self.filled_or_refused(told, format!("most of its {grid} chunks never written"))?;
+        }
+        let chunks = guard(&self.path, name, || dataset.chunks())?;
+        let inside = |c: &&Chunk| c.offset.iter().zip(shape).all(|(at, end)| at < end);
+        let written = chunks.iter().filter(inside).count() as u64;
+        if written < grid && note.is_none() {
+            let what = match written {
+                0 => "created, but never written".into(),
+                _ => format!("{} of its {grid} chunks never written", grid - written),
+            };
+            note = self.filled_or_refused(told, what)?;
+        }
+        let past_end = |c: &Chunk| c.address.checked_add(c.storage_size).is_none_or(|end| end > self.bytes);
+        if chunks.iter().any(past_end) {
+            let found = "a chunk beyond the end of the file";
+            return Err(self.invalid(Problem::Truncated, name, found, "every chunk in the file", REPAIR));
+        }
+        let stored: u64 = chunks.iter().map(|c| c.storage_size).fold(0, u64::saturating_add);
+        let padded = (chunks.len() as u64).saturating_mul(chunk.unwrap_or(u64::MAX));
+        if padded > stored.saturating_mul(MAX_EXPANSION) {
+            return Err(self.oversized(name, Some(padded)));
+        }
+        self.ensure_filters(name, dataset, &chunks)?;
+        if note.is_none() && !fits { Err(self.oversized(name, *announced)) } else { Ok(note) }
+    }
+
+    /// More data than the file can hold.
+    fn oversized(&self, name: &str, announced: Option<u64>) -> DataError {
+        let announced = announced.map_or("more than 2^64".to_owned(), |n| n.to_string());
+        let found = format!("{announced} bytes announced, in a file of {} bytes", self.bytes);
+        self.invalid(Problem::Oversized, name, found, "no more data than the file can hold", REPAIR)
+    }
+
+    /// What is missing is filled, with a note, or refused.
+    fn filled_or_refused(&self, told: &Told<'_>, what: String) -> Result<Option<String>, DataError> {
+        let Told { name, shape, announced, fits, unwritten, .. } = told;
+        match unwritten {
+            Unwritten::Refuse if !fits => Err(self.oversized(name, *announced)),
             Unwritten::Refuse => Err(self.invalid(
                 Problem::Truncated,
                 name,
@@ -50,79 +139,16 @@ impl Hdf5 {
             Unwritten::Fill => {
                 let (rows, here) = (self.written_rows()?, shape.first().copied().unwrap_or(1));
                 if here != rows {
-                    let found = format!("{here} rows, {what}");
-                    let advice = "The fields must have one row per transition: write the file again";
                     return Err(self.invalid(
                         Problem::RowCount,
                         name,
-                        found,
+                        format!("{here} rows, {what}"),
                         format!("{rows} rows, as in `observations`"),
-                        advice,
+                        "The fields must have one row per transition: write the file again",
                     ));
                 }
                 Ok(Some(format!("`{name}`: {what}; read as its fill value, as h5py does")))
             }
-        };
-        match guard(&self.path, name, || dataset.layout())? {
-            Layout::Contiguous { address: None, .. } => {
-                // Data in a file of its own looks the same, except to a reader.
-                match guard(&self.path, name, || Ok(dataset.read_raw_rows(0, 1)))? {
-                    Err(Error::Format(FormatError::UnsupportedExternalStorage)) => {
-                        Err(self.elsewhere(name, "raw data in another file"))
-                    }
-                    _ => missing("created, but never written".into()),
-                }
-            }
-            Layout::Contiguous { .. } | Layout::Compact { .. } if announced.is_none_or(|n| n > self.bytes) => {
-                Err(oversized(announced))
-            }
-            Layout::Chunked { chunk_shape, index } => {
-                if index == ChunkIndex::BTreeV2 {
-                    let found = "chunks under a version 2 B-tree (several unlimited dimensions, libver=\"latest\")";
-                    let advice = format!("Store it anew: {COPY}");
-                    return Err(self.invalid(
-                        Problem::Unsupported,
-                        name,
-                        found,
-                        "at most one unlimited dimension",
-                        advice,
-                    ));
-                }
-                let chunk = bytes_of(&chunk_shape);
-                if chunk_shape.contains(&0) || chunk_shape.len() != shape.len() {
-                    return Err(oversized(chunk));
-                }
-                let grid = shape.iter().zip(&chunk_shape).try_fold(1u64, |n, (s, c)| n.checked_mul(s.div_ceil(*c)));
-                let grid = grid.ok_or_else(|| oversized(None))?;
-                // Every stored chunk costs an address or, where the index has none, an element: the others are missing.
-                let mut note = None;
-                if grid > self.bytes / element.clamp(1, 8) {
-                    note = missing(format!("most of its {grid} chunks never written"))?;
-                }
-                let chunks = guard(&self.path, name, || dataset.chunks())?;
-                let inside = |c: &&Chunk| c.offset.iter().zip(&shape).all(|(at, end)| at < end);
-                let written = chunks.iter().filter(inside).count() as u64;
-                if written < grid && note.is_none() {
-                    note = missing(match written {
-                        0 => "created, but never written".into(),
-                        _ => format!("{} of its {grid} chunks never written", grid - written),
-                    })?;
-                }
-                let past_end = |c: &Chunk| c.address.checked_add(c.storage_size).is_none_or(|end| end > self.bytes);
-                if chunks.iter().any(past_end) {
-                    let found = "a chunk beyond the end of the file";
-                    return Err(self.invalid(Problem::Truncated, name, found, "every chunk in the file", REPAIR));
-                }
-                let stored: u64 = chunks.iter().map(|c| c.storage_size).fold(0, u64::saturating_add);
-                let padded = (chunks.len() as u64).saturating_mul(chunk.unwrap_or(u64::MAX));
-                if padded > stored.saturating_mul(MAX_EXPANSION) {
-                    return Err(oversized(Some(padded)));
-                }
-                self.ensure_filters(name, dataset, &chunks)?;
-                if note.is_none() && !fits { Err(oversized(announced)) } else { Ok(note) }
-            }
-            Layout::Virtual => Err(self.elsewhere(name, "a virtual data set")),
-            _ => Ok(None),
         }
     }
 

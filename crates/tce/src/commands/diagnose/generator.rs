@@ -8,16 +8,15 @@ use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
+use tce_run::diagnosis::cycles::{Asked, AtCycle, Cycles, cycles};
+use tce_run::diagnosis::generator::{Consistency, Quality, Tried, consistency, hold_out, step_std};
+use tce_run::error::Result;
+use tce_run::expand::{finisher, label_models, networks};
+use tce_run::inputs::{DataArgs, Inputs};
+use tce_run::layers::ConfigArgs;
+use tce_run::variant::Variant;
 
-use crate::diagnosis::cycles::{AtCycle, Cycles, cycles};
-use crate::diagnosis::generator::{Consistency, Quality, consistency, hold_out, quality, step_std};
-use crate::error::Result;
-use crate::expand::{Finisher, label_models};
-use crate::generator::Generator;
-use crate::inputs::{DataArgs, Inputs};
-use crate::layers::ConfigArgs;
 use crate::output::{Output, table};
-use crate::variant::Variant;
 
 /// Arguments of `generator`.
 #[derive(Debug, Args)]
@@ -149,10 +148,10 @@ impl GeneratorArgs {
         let mut rows = Vec::new();
         let mut floors = None;
         for process in processes {
-            let generator_config = crate::config::GeneratorConfig { process, ..config.generator.clone() };
-            let varied = crate::config::Config { generator: generator_config.clone(), ..config.clone() };
-            let (generator, ..) = Generator::train(&inputs, &varied, &seeds, &self.data.out, device)?;
-            let finisher = Finisher::new(&generator.units, &models, &config, &inputs);
+            let generator_config = tce_augment::config::GeneratorConfig { process, ..config.generator.clone() };
+            let varied = tce_run::config::Config { generator: generator_config.clone(), ..config.clone() };
+            let (generator, ..) = networks(&inputs, &varied, &seeds, &self.data.out, device)?;
+            let finisher = finisher(&generator.units, &models, &config, &inputs);
             if floors.is_none() {
                 let units = &generator.units;
                 let d = units.live.len();
@@ -164,18 +163,17 @@ impl GeneratorArgs {
                 floors =
                     Some((sw, consistency(place.0, place.1, &real, &step_std(training, &units.live), &units.live)?));
             }
+            let tried = Tried {
+                generator: &generator,
+                models: &models,
+                config: &generator_config,
+                finisher: &finisher,
+                training,
+                held_out: &held_out,
+                place,
+            };
             for sampler in &samplers {
-                let quality = quality(
-                    &generator,
-                    &models,
-                    &generator_config,
-                    sampler,
-                    &finisher,
-                    (training, &held_out),
-                    place,
-                    self.rows,
-                    self.seed,
-                )?;
+                let quality = tried.quality(sampler, self.rows, self.seed)?;
                 tce_base::note!(
                     "{} {}: SW to held-out states {:.3}, consistency {:.3}",
                     process_name(&process),
@@ -205,8 +203,8 @@ impl GeneratorArgs {
         let place = (self.task.agent, self.task.shift);
         let said =
             |n: &AtCycle| tce_base::note!("{}: action RMSE {}, score {}", n.cells()[0], n.cells()[4], n.cells()[10]);
-        let sizes = (self.rows, self.episodes);
-        let cycles = cycles(&inputs, &config, place, self.seed, sizes, &self.data.out, device, said)?;
+        let asked = Asked { place, seed: self.seed, rows: self.rows, episodes: self.episodes };
+        let cycles = cycles(&inputs, &config, asked, &self.data.out, device, said)?;
         output.print(&CyclesReport { task: self.task, episodes: self.episodes, cycles }, render_cycles);
         Ok(())
     }

@@ -9,16 +9,16 @@ use tce_data::Task;
 use tce_diagnosis::Diagnosis;
 use tce_learn::TransitionConfig;
 use tce_nn::Device;
+use tce_run::config::Config;
+use tce_run::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
+use tce_run::error::{Error, Result};
+use tce_run::inputs::{DataArgs, Inputs};
+use tce_run::layers::ConfigArgs;
+use tce_run::own::Own;
+use tce_run::study::task_of;
+use tce_run::variant::Variant;
 
-use crate::config::Config;
-use crate::diagnosis::{Options, Subject, can_be_diagnosed, diagnose, member_of};
-use crate::error::{Error, Result};
-use crate::inputs::{DataArgs, Inputs};
-use crate::layers::ConfigArgs;
 use crate::output::Output;
-use crate::own::Own;
-use crate::study::task_of;
-use crate::variant::Variant;
 
 mod generator;
 mod render;
@@ -177,7 +177,8 @@ impl Finished {
 }
 
 impl RunArgs {
-    fn run(self, output: Output, device: &Device) -> Result<()> {
+    /// What is measured, and how much of it.
+    fn options(&self) -> Result<Options> {
         if let Some(y) = self.y_max.iter().find(|y| !(0.0..=1.0).contains(*y)) {
             return Err(Error::Usage(format!("--y-max {y}: expected label bounds from 0 to 1")));
         }
@@ -197,15 +198,19 @@ impl RunArgs {
             }
         }
         let defaults = Options::default();
-        let options = Options {
+        Ok(Options {
             rows: self.rows,
-            y_max: self.y_max,
+            y_max: self.y_max.clone(),
             simulator: !self.no_simulator,
             transition: TransitionConfig { steps: self.transition_steps, ..defaults.transition },
             value_steps: self.value_steps,
             abundant: self.abundant,
             episodes: self.episodes,
-        };
+        })
+    }
+
+    fn run(self, output: Output, device: &Device) -> Result<()> {
+        let options = self.options()?;
         let (diagnosis, place) = match &self.run {
             Some(directory) => {
                 let run = Finished::read(directory)?;

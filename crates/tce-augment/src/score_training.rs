@@ -1,0 +1,145 @@
+//! Training of score networks, for a given length or until it no longer helps, and what is held out to tell.
+
+use tce_base::random::choose;
+use tce_base::{Progress, Streams};
+use tce_diffusion::{CycleEnd, Process, Sampler, ScoreData, ScoreModel, Trainer, UntilDone};
+use tce_nn::Checkpoints;
+
+use crate::config::{GeneratorConfig, Length};
+use crate::error::Result;
+use crate::work::Keeper;
+
+/// Figures of a network at the end of a cycle, one number per member each. The first one decides when the training is done; the less
+/// the better.
+pub(crate) type Figures = Vec<(&'static str, Vec<f64>)>;
+
+/// How long a network is trained.
+pub(crate) enum Course<'a> {
+    /// So many updates.
+    Steps(u64),
+    /// Until the first of its figures no longer falls.
+    UntilDone {
+        /// The cycles.
+        plan: UntilDone,
+        /// Measures the network.
+        judge: &'a (dyn Fn(&Trainer) -> Result<Figures> + Sync),
+    },
+}
+
+/// A network that was trained.
+pub(crate) struct Ready {
+    /// The network.
+    pub model: ScoreModel,
+    /// Last reported loss, per member.
+    pub loss: Vec<f32>,
+    /// What decided at the ends of the cycles; empty where the length was given.
+    pub curve: Vec<CycleEnd>,
+}
+
+/// Trains, and keeps the losses and, where there are cycles, the network at the end of each of them.
+pub(crate) fn run(
+    trainer: &mut Trainer,
+    data: &ScoreData,
+    course: &Course,
+    checkpoints: &mut Checkpoints,
+    keeper: &dyn Keeper,
+    name: &str,
+) -> Result<Ready> {
+    let data = std::slice::from_ref(data);
+    let log = |step: u64, figure: &'static str, values: &[f64]| keeper.record(name, step, figure, values);
+    let mut loss = Vec::new();
+    let end = match course {
+        Course::Steps(steps) => Some(*steps),
+        Course::UntilDone { .. } => None,
+    };
+    let on_loss = |step: u64, losses: &[f32]| {
+        loss = losses.to_vec();
+        if step.is_multiple_of(500) || Some(step) == end {
+            log(step, "loss", &losses.iter().map(|&l| f64::from(l)).collect::<Vec<_>>());
+        }
+    };
+    let (model, curve) = match course {
+        Course::Steps(steps) => {
+            trainer.train(data, *steps, checkpoints, on_loss)?;
+            (trainer.model(), Vec::new())
+        }
+        Course::UntilDone { plan, judge } => {
+            let judge = |trainer: &Trainer| -> Result<Vec<f64>> {
+                let figures = judge(trainer)?;
+                figures.iter().for_each(|(figure, values)| log(trainer.steps(), figure, values));
+                keeper.cycle(name, trainer.steps(), &trainer.model())?;
+                Ok(figures.into_iter().next().map(|(_, values)| values).unwrap_or_default())
+            };
+            trainer.train_until_done(data, plan, checkpoints, on_loss, judge)?
+        }
+    };
+    Ok(Ready { model, loss, curve })
+}
+
+/// Training rows (width `d`) for processes that start at data, `[P, rows, d]`; the others need none.
+pub(crate) fn start_rows(
+    process: Process,
+    training: impl FnOnce() -> Vec<f32>,
+    d: usize,
+    rows: usize,
+    members: &[Streams],
+    name: &str,
+) -> Option<Vec<f32>> {
+    use rand::RngExt;
+    if !process.starts_at_data() {
+        return None;
+    }
+    let training = training();
+    let n = training.len() / d;
+    let mut out = Vec::with_capacity(rows * members.len() * d);
+    for member in members {
+        let mut rng = member.stream(&format!("start/{name}"));
+        for _ in 0..rows {
+            let i = rng.random_range(0..n);
+            out.extend_from_slice(&training[i * d..(i + 1) * d]);
+        }
+    }
+    Some(out)
+}
+
+/// A progress bar of sampling.
+pub(crate) fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress {
+    Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
+}
+
+/// Rows that follow each other and are held out together: neighbours in time are too much alike for one to test the other.
+const HELD_OUT_RUN: usize = 25;
+
+/// The rows of `n` to train on, and the share that is held out, in runs at random places; both ascending. The same for all seeds.
+pub fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
+    // Of a single run one half would be held out from the other.
+    let length = if n > HELD_OUT_RUN { HELD_OUT_RUN } else { n.div_ceil(2).max(1) };
+    let runs = n.div_ceil(length);
+    let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
+    let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
+    (0..n).partition(|i| chosen.binary_search(&(i / length)).is_err())
+}
+
+/// Of `n` target rows, those that the networks of `config` are trained on, and those that are held out to tell when to stop.
+pub fn held_out_rows(n: usize, config: &GeneratorConfig) -> (Vec<usize>, Vec<usize>) {
+    let auto = [config.state_steps, config.transition_steps].contains(&Length::Auto);
+    hold_out_runs(n, if auto { config.until_done.held_out } else { 0.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn held_out_rows_come_in_runs_and_are_the_share() {
+        let (kept, held_out) = hold_out_runs(5000, 0.05);
+        assert_eq!((kept.len(), held_out.len()), (4750, 250));
+        assert!(held_out.chunks(HELD_OUT_RUN).all(|run| run[0] % HELD_OUT_RUN == 0 && run[24] == run[0] + 24));
+        let mut all = [kept, held_out].concat();
+        all.sort_unstable();
+        assert_eq!(all, (0..5000).collect::<Vec<_>>());
+        assert_eq!(hold_out_runs(100, 0.0), ((0..100).collect(), vec![]));
+        let (kept, held_out) = hold_out_runs(60, 0.01);
+        assert!(!held_out.is_empty() && kept.len() >= 35, "at least one run, never all");
+    }
+}

@@ -1,0 +1,64 @@
+//! What bars, the line above them and notes share: one thing that draws on stderr.
+
+use std::io::IsTerminal;
+use std::sync::LazyLock;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Instant;
+
+use console::style;
+use indicatif::MultiProgress;
+
+/// All lines that change in place. One thing draws them, so that bars side by side and notes between them leave no line behind.
+pub(crate) static LINES: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
+
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Whether progress that starts from now on is shown at all.
+pub fn set_quiet(quiet: bool) {
+    QUIET.store(quiet, Ordering::Relaxed);
+}
+
+/// Whether progress that starts now is not shown.
+pub(crate) fn quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
+
+/// Whether lines can change in place.
+pub(crate) fn in_place() -> bool {
+    static TERMINAL: LazyLock<bool> =
+        LazyLock::new(|| std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb"));
+    *TERMINAL && !quiet()
+}
+
+/// A line of text on stderr, above all bars. Written by [`note!`](crate::note).
+#[doc(hidden)]
+pub fn say(text: &str) {
+    let print = || match text.strip_prefix("warning:") {
+        Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
+        None => eprintln!("{text}"),
+    };
+    // Without bars there is nothing to put aside.
+    if in_place() { LINES.suspend(print) } else { print() }
+}
+
+/// `eprintln!` for notes beside the results: where bars are drawn, the note stands above them.
+#[macro_export]
+macro_rules! note {
+    ($($text:tt)*) => { $crate::terminal::say(&format!($($text)*)) };
+}
+
+/// How far a piece of work is. Apart from the bar, because the line above the bars asks while they are drawn.
+pub(crate) struct Counter {
+    pub(crate) label: String,
+    pub(crate) total: u64,
+    pub(crate) done: AtomicU64,
+    pub(crate) started: Instant,
+}
+
+impl Counter {
+    /// Seconds that are left at the rate so far; None where that says nothing yet.
+    pub(crate) fn left(&self) -> Option<f64> {
+        let (done, seconds) = (self.done.load(Ordering::Relaxed), self.started.elapsed().as_secs_f64());
+        (done > 0 && seconds > 2.0).then(|| self.total.saturating_sub(done) as f64 * seconds / done as f64)
+    }
+}

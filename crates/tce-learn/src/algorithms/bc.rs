@@ -1,0 +1,206 @@
+//! Behaviour cloning.
+//!
+//! L_π = E over (s, a) of ℓ(s, a): for the default policy form the mean squared error of tanh(μ(s)), see [`crate::actor`].
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | - | `actor` | deterministic, 256-256, Adam 3e-4, cosine | as the policies of IQL |
+//! | - | `dropout` | 0 | of hidden units, while it is trained: Srivastava et al. 2014 |
+//! | E | `ensemble` | 1 | own: policies whose outputs are averaged before the tanh |
+//! | - | `mixed_steps` | 0 | own: generated rows are fitted sooner than they are right, see below |
+//! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
+//!
+//! Behaviour policies are sampled, and a network that fits 5000 noisy actions to the last digit fits their noise: on HalfCheetah two
+//! layers come to an error of .04 at their rows and .20 at those of an episode that they have not seen. Dropout lowers the second error,
+//! but the policies score less; a third layer lowers it, and they score more (bench/expansion.md).
+//!
+//! Clones of one data set differ by where their weights began, and so does whether they fall. The mean of several makes fewer of
+//! the errors that they do not share: Walker2d, four clones of the same rows, 48 to 88 points each, 93.5 together (bench/expansion.md).
+//! An ensemble sees the same batches and becomes one wider network ([`crate::MlpPolicy::average`]).
+//!
+//! Clones of target and generated rows get worse again when they are trained longer than clones of the target rows alone: HalfCheetah,
+//! ensembles of five, 73, 77, 68 points after 8k, 15k, 30k steps; Walker2d 70, 93, 92 (bench/expansion.md). The caller asks
+//! [`BcConfig::steps`] how long to train.
+//!
+//! Raw or standardised observations, and all rows or the best trajectories, are properties of a member's data: one
+//! population may hold all of them.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use tce_base::Streams;
+use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
+
+use crate::actor::{Actor, ActorConfig, PolicyForm};
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::{LearnError, within};
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
+use crate::networks::Dropout;
+use crate::policy::{Policy, PolicyLearner};
+use crate::training::{Learner, Meter};
+
+const ABOUT: About = About {
+    name: "bc",
+    description: "behaviour cloning; of the best trajectories with learner.top",
+    reference: "Pomerleau 1989",
+    published: None,
+    table: "bc",
+    needs: OtherRows::Any,
+    successors: false,
+    episodes: false,
+    scores: RowScores::None,
+};
+
+impl Method for BcConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)))
+    }
+
+    fn steps(&self, steps: u64, mixed: bool) -> u64 {
+        self.steps(steps, mixed)
+    }
+}
+
+/// The configuration of [`Bc`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct BcConfig {
+    /// The policy.
+    pub actor: ActorConfig,
+    /// Policies that are trained side by side; their outputs are averaged before the tanh.
+    #[schemars(range(min = 1, max = 64))]
+    pub ensemble: usize,
+    /// Share of hidden units that are left out of each update, at random.
+    #[serde(skip_serializing_if = "no_dropout")]
+    #[schemars(range(min = 0.0, max = 0.9))]
+    pub dropout: f64,
+    /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
+    /// as without them.
+    pub mixed_steps: u64,
+}
+
+impl Default for BcConfig {
+    fn default() -> Self {
+        Self { actor: ActorConfig::default(), ensemble: 1, dropout: 0.0, mixed_steps: 0 }
+    }
+}
+
+// The keys of runs that were done before there was dropout do not name it.
+fn no_dropout(rate: &f64) -> bool {
+    *rate == 0.0
+}
+
+impl BcConfig {
+    /// The steps of a training that is to take `steps`, by whether it has rows besides the target's.
+    pub fn steps(&self, steps: u64, mixed: bool) -> u64 {
+        match self.mixed_steps {
+            most if mixed && most > 0 => steps.min(most),
+            _ => steps,
+        }
+    }
+
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("dropout", self.dropout, 0.0..=0.9)?;
+        within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
+        if self.ensemble > 1 && self.actor.form != PolicyForm::TanhMean {
+            let (found, remedy) =
+                (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
+            return Err(LearnError::invalid("ensemble", found, "1, or policies without noise of their own", remedy));
+        }
+        Ok(())
+    }
+}
+
+/// Behaviour cloning of a population.
+pub struct Bc {
+    /// One population for each policy of the ensembles.
+    actors: Vec<Actor>,
+    members: Vec<Streams>,
+    dropout: f64,
+}
+
+impl Bc {
+    /// New policies for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If the configuration cannot be used.
+    pub fn new(buffer: &Buffer, config: &BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
+        config.check()?;
+        let actor = |k: usize| match k {
+            0 => Actor::new(buffer, &config.actor, steps, device),
+            k => Actor::named(&format!("policy {k}"), buffer, &config.actor, steps, device),
+        };
+        let actors = (0..config.ensemble).map(actor).collect::<Result<_, _>>()?;
+        Ok(Self { actors, members: buffer.streams(), dropout: config.dropout })
+    }
+}
+
+/// A step of one population. Returns its loss.
+fn step(actor: &mut Actor, batch: &Minibatch, mut dropout: Vec<Dropout>, step: u64) -> Tensor<3> {
+    let output = actor.forward_with(batch.s.clone(), |h| Dropout::apply_members(&mut dropout, h));
+    let loss = actor.imitation_loss(&output, batch.a.clone(), None);
+    drop(output);
+    let value = loss.clone().inner();
+    actor.step(loss, step);
+    value
+}
+
+/// What the names of policy `k` of an ensemble begin with in a checkpoint.
+fn prefix(k: usize) -> String {
+    if k == 0 { String::new() } else { format!("{k}/") }
+}
+
+impl Learner for Bc {
+    fn update(&mut self, batch: &Minibatch, at: u64, meter: &mut Meter) {
+        let masks = |k: usize| -> Vec<Dropout> {
+            let name = format!("dropout {k}");
+            self.members.iter().map(|m| Dropout::new(self.dropout, m.indexed(&name, at))).collect()
+        };
+        let actors = self.actors.par_iter_mut().enumerate();
+        let losses: Vec<_> = actors.map(|(k, actor)| step(actor, batch, masks(k), at)).collect();
+        losses.iter().for_each(|loss| meter.record("policy_loss", loss));
+    }
+
+    fn state(&self) -> NamedParameters {
+        let mut state = NamedParameters::default();
+        for (k, actor) in self.actors.iter().enumerate() {
+            // The first one's names are those of a policy alone.
+            let mut own = NamedParameters::default();
+            actor.save(&mut own);
+            state.extend_under(&prefix(k), own);
+        }
+        state
+    }
+
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        for (k, actor) in self.actors.iter_mut().enumerate() {
+            actor.load(&state.under(&prefix(k)), path)?;
+        }
+        Ok(())
+    }
+}
+
+impl PolicyLearner for Bc {
+    fn policies(&self) -> Vec<Policy> {
+        let all: Vec<Vec<Policy>> = self.actors.iter().map(Actor::policies).collect();
+        let Some((first, rest)) = all.split_first() else { return Vec::new() };
+        let member = |(m, policy): (usize, &Policy)| {
+            let ensemble: Vec<_> = std::iter::once(policy).chain(rest.iter().map(|p| &p[m])).collect();
+            Policy::average(&ensemble)
+        };
+        first.iter().enumerate().map(member).collect()
+    }
+}

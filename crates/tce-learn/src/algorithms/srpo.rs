@@ -1,0 +1,214 @@
+//! SRPO (Xue et al. 2023) on IQL, as IGDF's authors compare it: rewards are raised where the state looks like one of high value.
+//!
+//! ```text
+//! rows of a batch ranked by V(s): the best share ρ gets label 1, the rest 0
+//! L_D = BCE-with-logits(D(s), label)                                               → D
+//! r   ← r + λ ln clip(x, 1/c, c),   x = exp D(s) = p/(1 - p), the odds             then a step of IQL ([`crate::iql`])
+//! ```
+//!
+//! | symbol | field | default | source |
+//! |---|---|---|---|
+//! | λ | `lambda` | .1 | IGDF's repository (some tasks .3) |
+//! | ρ | `share` | .5 | the same (some tasks .2) |
+//! | c | `clip` | 10 | the same |
+//! | - | `hidden` | 256, 256 ReLU | the same |
+//! | - | `lr` | 1e-3 | the same |
+//! | - | `mode` | corrected | published: x is the logit D(s) itself |
+//!
+//! IGDF's authors stand it on another IQL (Gaussian log-likelihood for the policy: `learner.iql.policy_extraction = "awr_logprob"`); here all
+//! rivals stand on the same one.
+//!
+//! **Published**: the logit is clamped where the odds are meant. Every state with D(s) ≤ .1 (odds below 1.1) then loses λ ln 10,
+//! however unlike it is, and ln of a logit grows hardly at all.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use tce_nn::{Device, Mlp, MlpConfig, Module, NamedParameters, NetworkError, Tensor, Trained, host, tensor};
+
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::{LearnError, within};
+use crate::iql::{Iql, IqlConfig};
+use crate::losses::binary_cross_entropy;
+use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
+use crate::mode::Mode;
+use crate::on_iql::{OnIql, Shape};
+use crate::regulariser::Regulariser;
+use crate::selection::{best_others, kept_rows};
+use crate::training::Meter;
+
+const ABOUT: About = About {
+    name: "srpo",
+    description: "IQL; rewards raised where the state looks like one of high value",
+    reference: "Xue et al. 2023; IGDF's repository",
+    published: Some("the discriminator's logit is clamped where its odds are meant"),
+    table: "srpo",
+    needs: OtherRows::Any,
+    successors: true,
+    episodes: false,
+    scores: RowScores::None,
+};
+
+impl Method for SrpoConfig {
+    fn about(&self) -> About {
+        ABOUT
+    }
+
+    fn check(&self) -> Result<(), LearnError> {
+        self.check()
+    }
+
+    fn build(&self, on: &Setup<'_>) -> Built {
+        let Some(regulariser) = on.regulariser(self)? else { return Ok(None) };
+        Ok(Some(Box::new(Srpo::new(on.buffer, self, on.iql, regulariser, on.steps, on.device)?)))
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        Some(self.mode)
+    }
+
+    fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
+        Some(iql.clone())
+    }
+}
+
+/// The configuration of [`Srpo`]; see the [module](self).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SrpoConfig {
+    /// What enters the reward: the odds of the discriminator, or, as the public code has it, its logit.
+    pub mode: Mode,
+    /// λ, the weight of the discriminator's term in the rewards. Source: IGDF's repository, .3 on some tasks.
+    #[schemars(range(min = 0.0, max = 1000000.0))]
+    pub lambda: f64,
+    /// ρ, the share of a batch's states, those of the highest value, that the discriminator is shown as good. Source: IGDF's
+    /// repository, .2 on some tasks.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub share: f64,
+    /// c, the greatest odds that count; 1/c is the least. Source: IGDF's repository.
+    #[schemars(range(min = 1.0, max = 1000000.0))]
+    pub clip: f64,
+    /// Widths of the hidden layers of the discriminator. Source: IGDF's repository.
+    pub hidden: Vec<usize>,
+    /// Learning rate of the discriminator, constant. Source: IGDF's repository.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr: f64,
+}
+
+impl Default for SrpoConfig {
+    fn default() -> Self {
+        Self { mode: Mode::default(), lambda: 0.1, share: 0.5, clip: 10.0, hidden: vec![256, 256], lr: 1e-3 }
+    }
+}
+
+impl SrpoConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("lambda", self.lambda, 0.0..=1e6)?;
+        within("share", self.share, 0.0..=1.0)?;
+        within("clip", self.clip, 1.0..=1e6)?;
+        within("lr", self.lr, 0.0..=1.0)
+    }
+}
+
+/// SRPO of a population.
+pub type Srpo = OnIql<Discriminator>;
+
+/// D.
+pub struct Discriminator {
+    config: SrpoConfig,
+    net: Trained<Mlp>,
+}
+
+impl Srpo {
+    /// New networks for the members of `buffer`, to be trained for `steps` steps.
+    ///
+    /// # Errors
+    /// If a configuration cannot be used.
+    pub fn new(
+        buffer: &Buffer,
+        config: &SrpoConfig,
+        iql: &IqlConfig,
+        regulariser: Regulariser,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
+        config.check()?;
+        let net = MlpConfig::relu(buffer.inputs().len(), &config.hidden, 1);
+        let net = net.init(&buffer.streams(), "srpo", &device.clone().autodiff());
+        let shape = Discriminator { config: config.clone(), net: Trained::new(net) };
+        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape })
+    }
+}
+
+/// 1 for the share `share` of the rows with the greatest values, per member; `[P, B, 1]` as `values`.
+pub fn high_value_labels(values: Tensor<3>, share: f64) -> Tensor<3> {
+    let ([p, b, _], device) = (values.dims(), values.device());
+    let mut labels = vec![0.0; p * b];
+    for (labels, best) in labels.chunks_mut(b).zip(best_others(0, &host(values), b, kept_rows(share, b))) {
+        best.into_iter().for_each(|i| labels[i] = 1.0);
+    }
+    tensor(labels, [p, b, 1], &device)
+}
+
+/// λ ln clip(x, 1/c, c) for the logits of the discriminator.
+pub fn reward_shift(logits: Tensor<3>, config: &SrpoConfig) -> Tensor<3> {
+    let (low, high) = (1.0 / config.clip, config.clip);
+    let log = match config.mode {
+        Mode::Published => logits.clamp(low, high).log(),
+        // ln clip(exp D, 1/c, c) without the detour, which overflows.
+        Mode::Corrected => logits.clamp(low.ln(), high.ln()),
+    };
+    log * config.lambda
+}
+
+impl Shape for Discriminator {
+    fn shape(&mut self, iql: &Iql, batch: &Minibatch, _step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+        let Self { config: c, net } = self;
+        let labels = high_value_labels(iql.values(batch.s.clone()), c.share);
+        let loss = binary_cross_entropy(net.net().forward(batch.s.clone()), labels);
+        meter.record("discriminator_loss", &loss);
+        net.step(loss.sum(), c.lr);
+        let shift = reward_shift(net.net().valid().forward(batch.s.clone()), c);
+        meter.record("reward_shift", &shift);
+        (Minibatch { r: batch.r.clone() + shift, ..batch.clone() }, None)
+    }
+
+    fn save(&self, state: &mut NamedParameters) {
+        self.net.save("srpo", state);
+    }
+
+    fn load(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        self.net.load("srpo", state, path)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::cpu;
+
+    #[test]
+    fn the_modes_differ_in_what_is_clamped() {
+        let logits = [-5.0f32, 0.05, 1.0, 20.0];
+        let shift = |mode| {
+            let config = SrpoConfig { mode, lambda: 0.3, ..SrpoConfig::default() };
+            host(reward_shift(tensor(logits.to_vec(), [1, 4, 1], &cpu()), &config))
+        };
+        for (k, &x) in logits.iter().enumerate() {
+            let published = 0.3 * x.clamp(0.1, 10.0).ln();
+            let corrected = 0.3 * x.exp().clamp(0.1, 10.0).ln();
+            assert!((shift(Mode::Published)[k] - published).abs() < 1e-6);
+            assert!((shift(Mode::Corrected)[k] - corrected).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn the_upper_half_is_labelled() {
+        let values = tensor(vec![1.0, 4.0, 3.0, 2.0, 0.0, -1.0, -3.0, -2.0], [2, 4, 1], &cpu());
+        assert_eq!(host(high_value_labels(values, 0.5)), [0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0]);
+    }
+}

@@ -1,0 +1,8 @@
+//! What every training stands on: rows and batches, the one training loop, losses.
+
+pub(crate) mod blocks;
+pub(crate) mod buffer;
+pub mod losses;
+pub(crate) mod mode;
+pub mod sequences;
+pub(crate) mod training;

@@ -1,0 +1,478 @@
+//! One training loop for everything that learns, and what every learner is made of.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Mutex;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use tce_base::{Progress, Streams, interrupted, random::fill_normal};
+use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, on_threads_of, tensor};
+
+use crate::buffer::{Buffer, Minibatch};
+use crate::error::LearnError;
+
+/// Losses and other figures are taken every so many steps: they cost time, and their means need no more. A prime, because what a
+/// method does at every second step is to be seen too.
+const METER_EVERY: u64 = 11;
+/// Steps of a lane before the next one's turn.
+const TURN: u64 = 50;
+
+/// Where a training keeps its checkpoints, and what tells it from others.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'a> {
+    /// The directory; none keeps nothing, for trainings of seconds and tests.
+    pub directory: Option<&'a Path>,
+    /// A word that stands for all that decides the result.
+    pub key: &'a str,
+    /// Which of several trainings side by side.
+    pub lane: usize,
+    /// Takes the figures of what is trained before the first step.
+    pub journal: Option<&'a Journal>,
+}
+
+/// The figures of preparations, from lanes that may run side by side.
+#[derive(Debug, Default)]
+pub struct Journal(Mutex<Vec<(usize, String, Report)>>);
+
+impl Journal {
+    /// Lane, training and report, in the order of lanes and steps, whatever the order in which they came.
+    ///
+    /// # Panics
+    /// If a lane has panicked.
+    pub fn take(&self) -> Vec<(usize, String, Report)> {
+        let mut reports = std::mem::take(&mut *self.0.lock().expect("no lane has panicked"));
+        reports.sort_by_key(|(lane, ..)| *lane);
+        reports
+    }
+}
+
+/// How the checkpoints of [`prepare`] begin.
+const PREPARATION: &str = "prepare";
+/// Reports of a preparation.
+const PREPARATION_REPORTS: u64 = 10;
+
+impl Place<'_> {
+    /// Nothing is kept.
+    pub const NONE: Place<'static> = Place { directory: None, key: "", lane: 0, journal: None };
+
+    /// The checkpoints of the training `name` here.
+    ///
+    /// # Errors
+    /// If there are some that cannot be read.
+    pub fn checkpoints(&self, name: &str) -> Result<Checkpoints, LearnError> {
+        Ok(match self.directory {
+            Some(directory) => Checkpoints::open(directory, name, self.key)?,
+            None => Checkpoints::none(),
+        })
+    }
+
+    /// Removes what [`prepare`] kept, for all lanes: the result is on disk.
+    pub fn discard_preparations(&self) {
+        let entries = self.directory.and_then(|d| std::fs::read_dir(d).ok());
+        for entry in entries.into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            let name = name.to_string_lossy();
+            if name.starts_with(PREPARATION) && name.ends_with(".checkpoint") {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}
+
+/// Trains what a learner needs before its first step: `steps` steps on `buffer`, gone on with from the checkpoints at `place`, where
+/// the end is kept too. Its figures go to the journal of `place`. False if the user interrupted it.
+///
+/// # Errors
+/// If a checkpoint cannot be read or written.
+pub fn prepare<L: Learner>(
+    learner: &mut L,
+    buffer: &Buffer,
+    steps: u64,
+    label: &str,
+    place: Place<'_>,
+    device: &Device,
+) -> Result<bool, LearnError> {
+    let name = format!("{PREPARATION}-{}-{}", label.replace(' ', "-"), place.lane);
+    let mut checkpoints = place.checkpoints(&name)?;
+    let mut lanes = [Lane { learner, buffer }];
+    let steps = Steps::new(steps, (steps / PREPARATION_REPORTS).max(1));
+    let training = label.replace(' ', "-").to_lowercase();
+    let outcome = advance(&mut lanes, steps, label, &mut checkpoints, true, device, |_, report, _| {
+        if let Some(journal) = place.journal {
+            let mut reports = journal.0.lock().expect("no lane has panicked");
+            reports.push((place.lane, training.clone(), report.clone()));
+        }
+        Ok::<_, LearnError>(())
+    })?;
+    Ok(!outcome.interrupted)
+}
+
+/// Something that is trained one minibatch at a time, P members at once.
+pub trait Learner: Send {
+    /// One step. `step` counts from 0; figures go to `meter`.
+    fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter);
+
+    /// All parameters and optimiser states: what [`Learner::restore`] needs to go on as if nothing had happened.
+    fn state(&self) -> NamedParameters;
+
+    /// Puts back a [`Learner::state`]; `path` is where it came from, for messages.
+    ///
+    /// # Errors
+    /// If it belongs to another learner.
+    fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError>;
+}
+
+/// Draws of N(0, 1) `[P, rows, width]`, member m's from stream `index` of `name` of its own.
+pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 3], device: &Device) -> Tensor<3> {
+    let mut noise = vec![0.0; shape.iter().product()];
+    for (noise, streams) in noise.chunks_mut(shape[1] * shape[2]).zip(members) {
+        fill_normal(&mut streams.indexed(name, index), noise);
+    }
+    tensor(noise, shape, device)
+}
+
+/// Means of named figures, per member.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Meter {
+    #[serde(skip)]
+    active: bool,
+    #[serde(with = "bits")]
+    sums: BTreeMap<String, (Vec<f64>, u64)>,
+}
+
+/// Sums as the bits of the numbers: JSON has no NaN, and a member that has diverged has nothing else.
+mod bits {
+    use std::collections::BTreeMap;
+
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    type Sums<T> = BTreeMap<String, (Vec<T>, u64)>;
+
+    fn map<A: Copy, B>(sums: &Sums<A>, f: fn(A) -> B) -> Sums<B> {
+        sums.iter().map(|(name, (sum, n))| (name.clone(), (sum.iter().map(|v| f(*v)).collect(), *n))).collect()
+    }
+
+    pub fn serialize<S: Serializer>(sums: &Sums<f64>, to: S) -> Result<S::Ok, S::Error> {
+        map(sums, f64::to_bits).serialize(to)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Sums<f64>, D::Error> {
+        Ok(map(&Sums::<u64>::deserialize(from)?, f64::from_bits))
+    }
+}
+
+impl Meter {
+    /// A meter that takes every figure.
+    pub fn always() -> Self {
+        Self { active: true, ..Self::default() }
+    }
+
+    /// Whether figures are wanted at this step; learners ask before they compute any.
+    pub fn active(&self) -> bool {
+        self.active
+    }
+
+    /// An empty meter that is as active, for work on another thread; [`Meter::join`] takes its figures back.
+    pub fn fork(&self) -> Self {
+        Self { active: self.active, ..Self::default() }
+    }
+
+    /// Takes the figures of a [`Meter::fork`].
+    pub fn join(&mut self, fork: Self) {
+        for (name, (values, count)) in fork.sums {
+            let (sum, n) = self.sums.entry(name).or_insert_with(|| (vec![0.0; values.len()], 0));
+            sum.iter_mut().zip(values).for_each(|(s, v)| *s += v);
+            *n += count;
+        }
+    }
+
+    /// Takes the mean over each member's entries of `value` `[P, ·, ·]`.
+    pub fn record(&mut self, name: &str, value: &Tensor<3>) {
+        if self.active {
+            let members = value.dims()[0];
+            let values = host(value.clone());
+            let per_member = values.len() / members;
+            let means = values.chunks(per_member).map(|c| c.iter().map(|&v| v as f64).sum::<f64>() / per_member as f64);
+            self.add(name, means.collect());
+        }
+    }
+
+    /// Takes one figure per member.
+    pub fn add(&mut self, name: &str, per_member: Vec<f64>) {
+        let (sum, count) = self.sums.entry(name.to_owned()).or_insert_with(|| (vec![0.0; per_member.len()], 0));
+        sum.iter_mut().zip(per_member).for_each(|(s, v)| *s += v);
+        *count += 1;
+    }
+
+    /// The means since the last call, and starts anew.
+    pub fn take(&mut self) -> BTreeMap<String, Vec<f64>> {
+        let means = |(sum, n): (Vec<f64>, u64)| sum.into_iter().map(|s| s / n as f64).collect();
+        std::mem::take(&mut self.sums).into_iter().map(|(name, entry)| (name, means(entry))).collect()
+    }
+}
+
+/// What [`train`] tells now and then.
+#[derive(Clone, Debug)]
+pub struct Report {
+    /// Steps done.
+    pub step: u64,
+    /// Mean of each figure since the last report, per member.
+    pub metrics: BTreeMap<String, Vec<f64>>,
+}
+
+impl From<(u64, Meter)> for Report {
+    fn from((step, mut figures): (u64, Meter)) -> Self {
+        Self { step, metrics: figures.take() }
+    }
+}
+
+impl Report {
+    /// Members with a figure that is not a finite number: their training has diverged. The others do not feel it.
+    pub fn diverged(&self) -> Vec<usize> {
+        let members = self.metrics.values().map(Vec::len).max().unwrap_or(0);
+        let bad = |m: &usize| self.metrics.values().any(|v| v.get(*m).is_some_and(|x| !x.is_finite()));
+        (0..members).filter(bad).collect()
+    }
+}
+
+/// How many steps, and how often to tell.
+#[derive(Clone, Copy, Debug)]
+pub struct Steps {
+    /// First step, 0 unless resumed.
+    pub from: u64,
+    /// One past the last.
+    pub to: u64,
+    /// A report every so many steps, and at the end; 0 for the end only.
+    pub report_every: u64,
+}
+
+impl Steps {
+    /// `count` steps from the beginning.
+    pub fn new(count: u64, report_every: u64) -> Self {
+        Self { from: 0, to: count, report_every }
+    }
+}
+
+/// How a training ended: the step it stands at, and whether the user stopped it before its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Outcome {
+    /// Steps done; where to resume from.
+    pub step: u64,
+    /// Whether it was interrupted.
+    pub interrupted: bool,
+}
+
+/// A learner and the rows it learns from.
+pub struct Lane<'a, L: ?Sized> {
+    /// The learner.
+    pub learner: &'a mut L,
+    /// Its rows.
+    pub buffer: &'a Buffer,
+}
+
+/// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one lane.
+///
+/// # Errors
+/// That of `on_report`, and those of the checkpoints.
+pub fn train<L: Learner + ?Sized, E: From<LearnError>>(
+    learner: &mut L,
+    buffer: &Buffer,
+    steps: Steps,
+    label: &str,
+    checkpoints: &mut Checkpoints,
+    device: &Device,
+    mut on_report: impl FnMut(&Report, &L) -> Result<(), E>,
+) -> Result<Outcome, E> {
+    let mut lanes = [Lane { learner, buffer }];
+    train_side_by_side(&mut lanes, steps, label, checkpoints, device, |_, report, l| on_report(report, l))
+}
+
+/// Trains the learners of all lanes, with one progress bar named `label`.
+///
+/// Lanes take the threads in turns of a few steps, so that three lanes keep two cores busy; what a lane learns does not
+/// depend on the others, nor on the number of threads. `on_report` gets the lane, the means of its figures and its learner,
+/// to evaluate or save it; its error ends the training. The learners' device is the one of their parameters; batches are
+/// made on `device`, each while the update before it runs.
+///
+/// With `checkpoints` the training goes on from the newest one, and keeps one now and then and when the user interrupts: the
+/// result and all reports are then those of an undisturbed training. A training that is done leaves them to the caller, who removes
+/// them once the result is safe.
+///
+/// # Errors
+/// That of `on_report`; if a checkpoint does not fit the learners or cannot be written.
+pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
+    lanes: &mut [Lane<L>],
+    steps: Steps,
+    label: &str,
+    checkpoints: &mut Checkpoints,
+    device: &Device,
+    on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
+) -> Result<Outcome, E> {
+    advance(lanes, steps, label, checkpoints, false, device, on_report)
+}
+
+/// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own. Its reports are in the
+/// checkpoints and are all given at the end, those of an earlier process and of one that had nothing left to do included.
+fn advance<L: Learner + ?Sized, E: From<LearnError>>(
+    lanes: &mut [Lane<L>],
+    steps: Steps,
+    label: &str,
+    checkpoints: &mut Checkpoints,
+    keep_end: bool,
+    device: &Device,
+    mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
+) -> Result<Outcome, E> {
+    let mut runs: Vec<_> = lanes.iter_mut().map(Run::new).collect();
+    let mut step = steps.from;
+    if let Some((at, state, path)) = checkpoints.restore() {
+        for (k, run) in runs.iter_mut().enumerate() {
+            run.restore(k, &state, &path).map_err(LearnError::from)?;
+        }
+        step = at;
+    }
+    let begun = step;
+    let total = steps.to.saturating_sub(step) * runs.len() as u64;
+    let progress = Progress::new(label, total, "steps");
+    while step < steps.to {
+        let stop = interrupted();
+        if step > steps.from && (stop || checkpoints.due()) {
+            checkpoints.keep(step, state_of(&runs)).map_err(LearnError::from)?;
+        }
+        if stop {
+            return Ok(Outcome { step, interrupted: true });
+        }
+        let due = match steps.report_every {
+            0 => steps.to,
+            every => ((step / every + 1) * every).min(steps.to),
+        };
+        let turn = step..due.min(step + TURN);
+        on_threads_of(device, || {
+            runs.par_iter_mut().for_each(|run| run.advance(turn.clone(), steps.to, device, &progress));
+        });
+        step = turn.end;
+        if step == due {
+            for (k, run) in runs.iter_mut().enumerate() {
+                let figures = (step, std::mem::take(&mut run.meter));
+                let report = Report::from(figures.clone());
+                for member in report.diverged() {
+                    tce_base::note!(
+                        "{label}: member {} has diverged at step {step} (a loss is not finite)",
+                        k + member
+                    );
+                }
+                match keep_end {
+                    true => run.history.push(figures),
+                    false => on_report(k, &report, run.lane.learner)?,
+                }
+            }
+        }
+    }
+    progress.finish();
+    if keep_end {
+        if begun < steps.to {
+            checkpoints.keep(steps.to, state_of(&runs)).map_err(LearnError::from)?;
+        }
+        for (k, run) in runs.iter_mut().enumerate() {
+            for report in std::mem::take(&mut run.history).into_iter().map(Report::from) {
+                on_report(k, &report, run.lane.learner)?;
+            }
+        }
+    }
+    Ok(Outcome { step: steps.to.max(steps.from), interrupted: false })
+}
+
+/// The state of all lanes.
+fn state_of<L: Learner + ?Sized>(runs: &[Run<L>]) -> NamedParameters {
+    let mut state = NamedParameters::default();
+    runs.iter().enumerate().for_each(|(k, run)| run.keep(k, &mut state));
+    state
+}
+
+/// A lane under way.
+struct Run<'a, 'b, L: ?Sized> {
+    lane: &'a mut Lane<'b, L>,
+    meter: Meter,
+    /// Figures that were due and are given at the end, with their steps.
+    history: Vec<(u64, Meter)>,
+    /// The batch of the next step.
+    next: Option<Minibatch>,
+}
+
+impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
+    fn new(lane: &'a mut Lane<'b, L>) -> Self {
+        Self { lane, meter: Meter::default(), history: Vec::new(), next: None }
+    }
+
+    /// Adds the state of this lane, number `k`, to a checkpoint.
+    fn keep(&self, k: usize, state: &mut NamedParameters) {
+        let own = self.lane.learner.state();
+        state.extend_under(&format!("{k}/"), own);
+        let figures = serde_json::to_string(&(&self.meter, &self.history)).expect("plain data");
+        state.metadata.insert(format!("{k}/meter"), figures);
+    }
+
+    /// Puts back what [`Run::keep`] added.
+    fn restore(&mut self, k: usize, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
+        let mut own = state.under(&format!("{k}/"));
+        // Until November 2026 there was no history.
+        let figures = |text: String| {
+            serde_json::from_str(&text).ok().or_else(|| Some((serde_json::from_str(&text).ok()?, Vec::new())))
+        };
+        let meter = own.metadata.remove("meter").and_then(figures);
+        (self.meter, self.history) = meter.ok_or_else(|| NetworkError::Format {
+            path: path.to_owned(),
+            reason: format!("no figures of lane {k}, so no checkpoint of this training; remove it to begin anew"),
+        })?;
+        self.lane.learner.restore(&own, path)
+    }
+
+    fn advance(&mut self, turn: std::ops::Range<u64>, end: u64, device: &Device, progress: &Progress) {
+        let Lane { learner, buffer } = self.lane;
+        for step in turn {
+            let batch = self.next.take().unwrap_or_else(|| buffer.sample(step, device));
+            self.meter.active = step % METER_EVERY == 0;
+            let meter = &mut self.meter;
+            let (_, next) = rayon::join(
+                || learner.update(&batch, step, meter),
+                || (step + 1 < end).then(|| buffer.sample(step + 1, device)),
+            );
+            self.next = next;
+            progress.inc(1);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tce_nn::cpu;
+
+    #[test]
+    fn figures_are_means_per_member() {
+        let mut meter = Meter::always();
+        meter.record("x", &tensor(vec![1.0, 3.0, 10.0, 20.0], [2, 2, 1], &cpu()));
+        meter.record("x", &tensor(vec![4.0, 4.0, 0.0, 0.0], [2, 2, 1], &cpu()));
+        assert_eq!(meter.take()["x"], [3.0, 7.5]);
+        assert!(meter.take().is_empty());
+    }
+
+    #[test]
+    fn figures_survive_a_checkpoint_whatever_they_are() {
+        let mut meter = Meter::default();
+        meter.add("x", vec![f64::NAN, 0.1 + 0.2]);
+        let text = serde_json::to_string(&meter).unwrap();
+        let mut back: Meter = serde_json::from_str(&text).unwrap();
+        let x = back.take()["x"].clone();
+        assert!(x[0].is_nan() && x[1] == 0.1 + 0.2, "{x:?}");
+    }
+
+    #[test]
+    fn a_diverged_member_is_named() {
+        let report = Report {
+            step: 1,
+            metrics: BTreeMap::from([("a".into(), vec![1.0, f64::NAN]), ("b".into(), vec![0.0, 0.0])]),
+        };
+        assert_eq!(report.diverged(), [1]);
+    }
+}

@@ -1,0 +1,237 @@
+//! The configuration of a run, typed. What a field's comment says is what `tce config show KEY` tells a user ([`crate::keys`]): a sentence on
+//! what the key does, and behind `Source:` where its value is from, if it is the same for every preset. Why a preset has a value is told
+//! beside the value, in `presets/`; where a value comes from, by [`crate::layers`].
+
+use serde::{Deserialize, Serialize};
+use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
+use tce_data::ScoreTable;
+use tce_learn::{DynamicsConfig, FittedQConfig, RowScores};
+
+use crate::error::{Error, Result};
+pub use crate::learners::{Algorithm, LearnerConfig};
+
+/// Everything that decides a run's result, apart from its data and seeds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The target data: how much of them is used, and which trajectories are imitated.
+    // Sweeps that were planned, and runs that were done, before there was this table have the whole target.
+    #[serde(default)]
+    pub target: TargetConfig,
+    /// Source data that a task does not bring along.
+    pub source: SourceConfig,
+    /// The two score networks q_mix and q_tran, and how they are sampled.
+    pub generator: GeneratorConfig,
+    /// Which generated rows are left out.
+    pub filter: FilterConfig,
+    /// Inverse dynamics and reward models, and where terminal flags come from.
+    pub labels: LabelsConfig,
+    /// Learned dynamics of both domains, by which policies are tried and, with `filter.by = "consistency"`, rows are filtered.
+    // Runs that were done before there was this table used no learned dynamics.
+    #[serde(default)]
+    pub dynamics: DynamicsConfig,
+    /// Fitted Q evaluation, which shows what policies are worth where no simulator does.
+    // It decides nothing, so that a run's key names it only where it is not as usual.
+    #[serde(default, skip_serializing_if = "FittedQConfig::is_default")]
+    pub fitted_q: FittedQConfig,
+    /// One network over whole rows, for `mixture.generated` = synther and dmc.
+    pub joint: SingleStageConfig,
+    /// The data the policy is learned from.
+    pub mixture: MixtureConfig,
+    /// The learner of the policy.
+    pub learner: LearnerConfig,
+    /// How policies are judged.
+    pub evaluation: EvaluationConfig,
+}
+
+/// How much of the target data is used.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TargetConfig {
+    /// How many rows of the target file are used, from the first on, as if the log had ended there. 0: all of them.
+    pub rows: usize,
+    /// Which of the target's trajectories are imitated.
+    // Runs that were done before there was this key imitate all of them.
+    #[serde(default)]
+    pub trajectories: Trajectories,
+}
+
+/// Which of the target's trajectories are imitated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Trajectories {
+    /// All of them.
+    #[default]
+    All,
+    /// The better ones, where the returns show two behaviours ([`tce_data::choose_trajectories`]); else all of them.
+    Auto,
+}
+
+/// Source data that a task does not bring along.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SourceConfig {
+    /// How many source rows are collected where a task names no source file. Source: Table C.1.
+    #[schemars(range(min = 1))]
+    pub rows: usize,
+}
+
+/// The keys of the single-stage generator that decide generated rows of this kind, or the scores of source rows alone: what a run's
+/// identity depends on. None where no key does.
+pub fn used_of_single_stage(
+    config: &SingleStageConfig,
+    generated: GeneratedRows,
+    algorithm: Algorithm,
+) -> Option<serde_json::Value> {
+    let mut used = serde_json::json!(config);
+    match (generated, algorithm) {
+        (GeneratedRows::Dmc, _) => {}
+        (GeneratedRows::Synther, _) => {
+            let keys = used.as_object_mut().expect("a table");
+            keys.remove("guidance");
+            keys.remove("scores");
+        }
+        (_, algorithm) if algorithm.about().scores == RowScores::Density => {
+            used = serde_json::json!({ "scores": config.scores });
+        }
+        _ => return None,
+    }
+    Some(used)
+}
+
+/// Which generated rows join the target rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum GeneratedRows {
+    /// None.
+    None,
+    /// TCE's: states, successors, filter, labels (`generator`, `filter`, `labels`).
+    Tce,
+    /// Whole transitions like the target's (`joint`).
+    Synther,
+    /// Whole transitions like the most target-like ones of source and target (`joint`).
+    Dmc,
+}
+
+/// Which source rows join the target rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceRows {
+    /// None of them.
+    None,
+    /// The λ share nearest to a target row (Eq. 9).
+    Nearest,
+    /// The λ share with the least optimal-transport cost (OTDF's).
+    Transport,
+    /// All of them.
+    All,
+    /// All of them, with actions inferred by the target's inverse dynamics (SwT, Appendix G.2).
+    Relabelled,
+}
+
+/// The data the policy is learned from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MixtureConfig {
+    /// Which generated rows join the target rows.
+    pub generated: GeneratedRows,
+    /// Which source rows join the target rows.
+    pub source: SourceRows,
+    /// λ, the share of source rows in the mixture; the rest are generated. Source: Eq. 9, Table C.5.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lambda: f64,
+}
+
+/// How policies are judged.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationConfig {
+    /// Episodes of an evaluation.
+    #[schemars(range(min = 1))]
+    pub episodes: usize,
+    /// Steps between evaluations on the way. 0: only the last policy is evaluated.
+    pub every: u64,
+    /// Whose reference returns a normalised score is measured by.
+    pub scores: ScoreTable,
+}
+
+impl Config {
+    /// The ranges that types cannot express.
+    pub fn validate(&self) -> Result<()> {
+        let within = |key: &str, value: f64, low: f64, high: f64| match value {
+            v if v >= low && v <= high => Ok(()),
+            v => Err(Error::Usage(format!("key `{key}`: found {v}, expected a number from {low} to {high}"))),
+        };
+        within("generator.y_max", self.generator.y_max.into(), 0.0, 1.0)?;
+        within("generator.ema", self.generator.ema, 0.0, 0.999_999)?;
+        let until_done = &self.generator.until_done;
+        within("generator.until_done.held_out", until_done.held_out, 0.001, 0.5)?;
+        for plan in [until_done.state(), until_done.transition()] {
+            plan.check().map_err(|e| Error::Usage(format!("generator.until_done: {e}")))?;
+        }
+        within("mixture.lambda", self.mixture.lambda, 0.0, 1.0)?;
+        within("learner.top", self.learner.top, 0.001, 1.0)?;
+        within("filter.z_threshold", self.filter.z_threshold, 0.1, 1e9)?;
+        within("filter.margin", self.filter.margin, 0.01, 1e9)?;
+        for (key, value) in [
+            ("source.rows", self.source.rows),
+            ("generator.batch", self.generator.batch),
+            ("dynamics.batch", self.dynamics.batch),
+            ("fitted_q.batch", self.fitted_q.batch),
+            ("fitted_q.replicates", self.fitted_q.replicates),
+            ("labels.training.batch", self.labels.training.batch),
+            ("learner.batch", self.learner.batch),
+            ("learner.steps", usize::try_from(self.learner.steps).unwrap_or(usize::MAX)),
+            ("evaluation.episodes", self.evaluation.episodes),
+        ] {
+            within(key, value as f64, 1.0, 1e12)?;
+        }
+        let joint = &self.joint;
+        within("joint.ema", joint.ema, 0.0, 0.999_999)?;
+        within("joint.guidance.dropout", joint.guidance.dropout, 0.0, 0.999)?;
+        within("joint.guidance.weight", joint.guidance.weight, 0.0, 100.0)?;
+        within("joint.guidance.from", joint.guidance.from, 0.0, 0.99)?;
+        // A row is its own nearest neighbour.
+        within("joint.scores.neighbour", joint.scores.neighbour as f64, 2.0, 1e6)?;
+        within("joint.scores.reference", joint.scores.reference as f64, joint.scores.neighbour as f64, 1e12)?;
+        for (key, value) in [
+            ("joint.width", joint.width),
+            ("joint.embedding", joint.embedding),
+            ("joint.batch", joint.batch),
+            ("joint.rows", joint.rows),
+        ] {
+            within(key, value as f64, 1.0, 1e12)?;
+        }
+        joint.process.check().map_err(|e| Error::Usage(format!("joint.process: {e}")))?;
+        joint.sampler.check().map_err(|e| Error::Usage(format!("joint.sampler: {e}")))?;
+        let about = self.learner.algorithm.about();
+        if about.scores == RowScores::Density {
+            let MixtureConfig { generated, source, .. } = self.mixture;
+            let scored = matches!(generated, GeneratedRows::None | GeneratedRows::Dmc)
+                && source != SourceRows::Relabelled
+                && (generated, source) != (GeneratedRows::None, SourceRows::None);
+            if !scored {
+                return Err(Error::Usage(format!(
+                    "learner.algorithm = {:?}: found mixture.generated = {generated:?} and mixture.source = {source:?}, expected \
+                     rows that have scores; use generated = \"dmc\", or \"none\" with source = \"all\", \"nearest\" or \"transport\"",
+                    about.name
+                )));
+            }
+        }
+        if self.mixture.generated == GeneratedRows::Tce && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
+            return Err(Error::Usage(
+                "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \
+                 a number of rows, a smaller lambda, or mixture.generated = \"none\""
+                    .into(),
+            ));
+        }
+        self.generator.process.check().map_err(|e| Error::Usage(format!("generator.process: {e}")))?;
+        self.generator.sampler.check().map_err(|e| Error::Usage(format!("generator.sampler: {e}")))?;
+        self.learner.check()
+    }
+
+    /// As TOML, for a run's directory.
+    pub fn to_toml(&self) -> String {
+        toml::to_string_pretty(self).expect("a configuration is plain data")
+    }
+}

@@ -1,0 +1,317 @@
+//! Which of several policies to put on the robot, told from the two data sets alone.
+//!
+//! A policy is tried in a learned model of the target's dynamics ([`tce_learn::dynamics`]: both domains' rows, the domain as an
+//! input). An imagined episode begins at a target state, keeps to one network of the ensemble, and ends where the network says that
+//! the state is terminal, where the state has left everything that either robot has been seen in, or after as many steps as the longest
+//! target episode has.
+//!
+//! | figure | meaning |
+//! |---|---|
+//! | imagined return | mean return of the imagined episodes, per step of a whole episode |
+//! | survival | share of the steps of whole episodes that were reached |
+//! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
+//! | action error | RMSE of the policy's actions at target states against the behaviour's |
+//! | fitted Q | discounted return from the starts of the target's episodes, by [`tce_learn::fitted_q`]: no model of the dynamics |
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use tce_augment::score_training::hold_out_runs;
+use tce_base::{Streams, mean_std, sha256_hex};
+use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, nn_distances};
+use tce_learn::{
+    Domain, Dynamics, DynamicsConfig, FittedQConfig, FittedValue, Learner, Policy, PolicyActions, discounted_return,
+    fitted_q, rmse, train_dynamics,
+};
+use tce_nn::{Device, NamedParameters};
+
+use crate::error::{Error, Result};
+use crate::inputs::{InputSpec, Inputs};
+use crate::stage::Stage;
+
+/// States from which a policy is tried, for each network of the ensemble.
+const STARTS: usize = 32;
+/// Share of the target rows that the ensemble does not see.
+const HELD_OUT: f64 = 0.05;
+/// A state further outside of everything seen than this share of a column's range ends an imagined episode.
+const MARGIN: f32 = 0.25;
+
+/// The trained ensemble, and how it does on target rows that it has not seen.
+pub struct Judge {
+    /// The ensemble.
+    pub dynamics: Dynamics,
+    /// Errors of the held-out target rows, ascending, in steps.
+    pub held_out: Vec<f64>,
+    /// The stage with its files.
+    pub stage: Stage,
+    root: PathBuf,
+    inputs: InputSpec,
+    target: Arc<Transitions>,
+    low: Vec<f32>,
+    high: Vec<f32>,
+    limit: usize,
+    /// The units of the policies' actions, where they are not the box.
+    actions: Option<ActionRange>,
+    spacing: f64,
+}
+
+/// What a policy does in the learned model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Judged {
+    /// Mean return of the imagined episodes.
+    pub imagined_return: f64,
+    /// Standard error of it, over the networks and the starts.
+    pub standard_error: f64,
+    /// Mean share of the steps of a whole episode.
+    pub survival: f64,
+    /// Median distance to the nearest target state.
+    pub distance: f64,
+    /// RMSE of the actions at target states.
+    pub action_error: f64,
+    /// The return of every imagined episode, networks one after the other.
+    pub returns: Vec<f64>,
+}
+
+impl Judge {
+    /// Trains the ensemble on the target's and, if there are any, the source's rows, or takes it from its stage.
+    pub fn train(inputs: &Inputs, config: &DynamicsConfig, root: &Path, device: &Device) -> Result<Self> {
+        #[derive(Serialize)]
+        struct Spec<'a> {
+            inputs: InputSpec,
+            config: &'a DynamicsConfig,
+            held_out: f64,
+        }
+        let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out: HELD_OUT };
+        tce_base::begin_step("learned dynamics");
+        let stage = Stage::open(root, "stages/dynamics", &spec, device)?;
+        let target = &inputs.target.rows;
+        let (kept, apart) = hold_out_runs(target.len(), HELD_OUT);
+        let source = inputs.source.as_ref().map(|s| Arc::new(s.rows.clone()));
+        let scale = even_standardizer(target, source.as_deref());
+        let training = Arc::new(target.select(&kept));
+        let mut dynamics = Dynamics::new(training, source.clone(), scale, Streams::new(0), config, device)?;
+        let file = "dynamics.safetensors";
+        let path = stage.file(file);
+        let held_out = match stage.summary::<Vec<f64>>()? {
+            Some(errors) => {
+                dynamics.restore(&NamedParameters::load(&path)?, &path)?;
+                errors
+            }
+            None => {
+                let attempt = stage.attempt()?;
+                let trained = train_dynamics(dynamics, &mut attempt.checkpoints("dynamics")?, device)?;
+                dynamics = trained.ok_or(Error::Interrupted)?;
+                let mut errors = dynamics.errors(&target.select(&apart), Domain::Target);
+                errors.sort_by(f64::total_cmp);
+                dynamics.state().save(&attempt.file(file))?;
+                attempt.finish(&[file.to_owned()], &errors)?;
+                errors
+            }
+        };
+        let tables: Vec<&Transitions> = std::iter::once(target).chain(source.as_deref()).collect();
+        let (low, high) = bounds(&tables);
+        let episodes = target.episodes();
+        let limit = episodes.iter().map(|e| e.end - e.start).max().unwrap_or(1);
+        Ok(Self {
+            dynamics,
+            held_out,
+            stage,
+            root: root.to_owned(),
+            inputs: inputs.spec(false),
+            spacing: spacing(target),
+            target: Arc::new(target.clone()),
+            low,
+            high,
+            limit,
+            actions: inputs.actions.clone(),
+        })
+    }
+
+    /// The rows whose successor is no further from what the ensemble expects than `margin` times what 95 % of held-out real rows are.
+    pub fn possible(&self, rows: &Transitions, margin: f64) -> Vec<usize> {
+        let threshold = margin * self.held_out_error(0.95);
+        let errors = self.dynamics.errors(rows, Domain::Target);
+        (0..rows.len()).filter(|&i| errors[i] <= threshold).collect()
+    }
+
+    /// A quantile of the errors on held-out target rows, in steps.
+    pub fn held_out_error(&self, quantile: f64) -> f64 {
+        let last = self.held_out.len().saturating_sub(1) as f64;
+        self.held_out.get((last * quantile) as usize).copied().unwrap_or(f64::NAN)
+    }
+
+    /// Tries a policy.
+    pub fn judge(&self, policy: &Policy) -> Result<Judged> {
+        let t = &self.target;
+        let starts = starts(t);
+        let networks = self.dynamics.members();
+        let (lanes, width, act) = (starts.len(), t.obs_dim, t.act_dim);
+        let first: Vec<f32> = starts.iter().flat_map(|&i| t.observation(i).iter().copied()).collect();
+        let mut states = vec![first; networks];
+        let mut memories = vec![vec![policy.start(); lanes]; networks];
+        let mut alive = vec![vec![true; lanes]; networks];
+        let mut returns = vec![vec![0.0; lanes]; networks];
+        let mut steps = vec![vec![0usize; lanes]; networks];
+        let mut visited = Transitions::new(width, 1);
+        for step in 0..self.limit {
+            if alive.iter().flatten().all(|a| !a) {
+                break;
+            }
+            let act_in = |(states, memories): (&Vec<f32>, &mut Vec<_>)| {
+                let mut actions = vec![0.0; lanes * act];
+                policy.act_with(states, memories, None, &mut actions);
+                self.actions.iter().for_each(|range| range.to_unit(&mut actions));
+                actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
+                actions
+            };
+            let actions: Vec<Vec<f32>> = states.par_iter().zip(memories.par_iter_mut()).map(act_in).collect();
+            let tables: Vec<(&[f32], &[f32])> =
+                states.iter().zip(&actions).map(|(s, a)| (s.as_slice(), a.as_slice())).collect();
+            let predictions = self.dynamics.predict(&tables, Domain::Target);
+            for (k, prediction) in predictions.into_iter().enumerate() {
+                for lane in 0..lanes {
+                    if !alive[k][lane] {
+                        continue;
+                    }
+                    let reward = f64::from(prediction.rewards[lane]);
+                    let next = &prediction.next_observations[lane * width..][..width];
+                    let inside =
+                        next.iter().zip(&self.low).zip(&self.high).all(|((x, low), high)| (*low..=*high).contains(x));
+                    returns[k][lane] += if reward.is_finite() { reward } else { 0.0 };
+                    policy.reward(&mut memories[k][lane], reward);
+                    steps[k][lane] += 1;
+                    alive[k][lane] = inside && !prediction.terminals[lane];
+                    if inside && step % 10 == 0 {
+                        visited.push(next, &[0.0], 0.0, next, false, true);
+                    }
+                }
+                // Lanes that are over stay where they are: what the networks say of them is not looked at.
+                for lane in 0..lanes {
+                    if alive[k][lane] {
+                        states[k][lane * width..][..width]
+                            .copy_from_slice(&prediction.next_observations[lane * width..][..width]);
+                    }
+                }
+            }
+        }
+        let returns = returns.concat();
+        let n = returns.len() as f64;
+        let (mean, std) = mean_std(&returns);
+        let actions = self.actions_at(policy, &t.observations);
+        Ok(Judged {
+            imagined_return: mean,
+            standard_error: std / n.sqrt(),
+            survival: steps.concat().iter().sum::<usize>() as f64 / (n * self.limit as f64),
+            distance: if visited.is_empty() { f64::INFINITY } else { median(distances(&visited, t)?) / self.spacing },
+            action_error: rmse(&actions, &t.actions),
+            returns,
+        })
+    }
+}
+
+impl Judge {
+    /// The mean actions of a policy, in the box of the rows. A policy that remembers its episode acts as in a first state.
+    fn actions_at(&self, policy: &Policy, observations: &[f32]) -> Vec<f32> {
+        let mut actions = vec![0.0; observations.len() / self.target.obs_dim * self.target.act_dim];
+        policy.act(observations, None, &mut actions);
+        self.actions.iter().for_each(|range| range.to_unit(&mut actions));
+        actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
+        actions
+    }
+
+    /// What the policies are worth by fitted Q evaluation on the target's rows, as one stage.
+    ///
+    /// # Errors
+    /// If a file cannot be read or written, or the user interrupts.
+    pub fn values(&self, policies: &[Policy], config: &FittedQConfig, device: &Device) -> Result<Vec<FittedValue>> {
+        #[derive(Serialize)]
+        struct Spec<'a> {
+            inputs: &'a InputSpec,
+            policies: Vec<String>,
+            config: &'a FittedQConfig,
+        }
+        let t = &self.target;
+        let starts: Vec<usize> = t.episodes().iter().map(|e| e.start).collect();
+        let first: Vec<f32> = starts.iter().flat_map(|&i| t.observation(i).iter().copied()).collect();
+        let actions = |policy: &Policy| PolicyActions {
+            next: self.actions_at(policy, &t.next_observations),
+            start: self.actions_at(policy, &first),
+        };
+        let actions: Vec<_> = policies.iter().map(actions).collect();
+        let hash = |a: &PolicyActions| {
+            sha256_hex(&a.next.iter().chain(&a.start).flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
+        };
+        // Its actions at these rows are all that decides a policy's value.
+        let spec = Spec { inputs: &self.inputs, policies: actions.iter().map(hash).collect(), config };
+        tce_base::begin_step("fitted Q");
+        let stage = Stage::open(&self.root, "stages/fitted-q", &spec, device)?;
+        if let Some(values) = stage.summary()? {
+            return Ok(values);
+        }
+        let attempt = stage.attempt()?;
+        let mut checkpoints = attempt.checkpoints("fitted-q")?;
+        let values = fitted_q(t, &starts, &actions, config, Streams::new(0), &mut checkpoints, device)?;
+        let values = values.ok_or(Error::Interrupted)?;
+        attempt.finish(&[], &values)?;
+        Ok(values)
+    }
+
+    /// The discounted return of the target's episodes as they were logged, to hold fitted values against.
+    pub fn behaviour_value(&self, config: &FittedQConfig) -> f64 {
+        discounted_return(&self.target, config.discount)
+    }
+}
+
+/// Where imagined episodes begin: the first states of all target episodes, and evenly spaced ones.
+fn starts(target: &Transitions) -> Vec<usize> {
+    let mut rows: Vec<usize> = target.episodes().iter().map(|e| e.start).take(STARTS).collect();
+    let more = STARTS.saturating_sub(rows.len()).min(target.len());
+    rows.extend((0..more).map(|i| i * target.len() / more));
+    rows
+}
+
+/// The least and the greatest value of every column over all states, with a margin.
+fn bounds(tables: &[&Transitions]) -> (Vec<f32>, Vec<f32>) {
+    let width = tables.first().map_or(0, |t| t.obs_dim);
+    let (mut low, mut high) = (vec![f32::INFINITY; width], vec![f32::NEG_INFINITY; width]);
+    for row in
+        tables.iter().flat_map(|t| t.observations.chunks_exact(width).chain(t.next_observations.chunks_exact(width)))
+    {
+        for ((low, high), &x) in low.iter_mut().zip(&mut high).zip(row) {
+            (*low, *high) = (low.min(x), high.max(x));
+        }
+    }
+    for (low, high) in low.iter_mut().zip(&mut high) {
+        let margin = MARGIN * (*high - *low);
+        (*low, *high) = (*low - margin, *high + margin);
+    }
+    (low, high)
+}
+
+/// Distance of every state of `rows` to the nearest state of `target`, in spreads of the target's columns.
+fn distances(rows: &Transitions, target: &Transitions) -> Result<Vec<f32>> {
+    let scale = Standardizer::fit(&target.observations, target.obs_dim);
+    let of = |t: &Transitions| scale.apply(&t.observations);
+    let (rows, target) = (of(rows), of(target));
+    let width = scale.dim();
+    Ok(nn_distances(&Rows::new(&rows, width), &Rows::new(&target, width), &NeighbourOptions::default())?)
+}
+
+fn median(mut values: Vec<f32>) -> f64 {
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() / 2).map_or(f64::NAN, |&v| f64::from(v))
+}
+
+/// The median distance between a target state and the nearest one of another episode; of the other half, where there is one episode.
+fn spacing(target: &Transitions) -> f64 {
+    let episodes = target.episodes();
+    let last = episodes.last().map_or(0, |e| e.start);
+    let cut = if last > 0 { last } else { target.len() / 2 };
+    let (rest, one): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|&i| i < cut);
+    match distances(&target.select(&one), &target.select(&rest)) {
+        Ok(distances) => median(distances).max(1e-6),
+        Err(_) => 1.0,
+    }
+}

@@ -1,0 +1,31 @@
+//! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
+
+pub mod config;
+pub mod course;
+pub mod diagnosis;
+pub mod error;
+pub mod expand;
+pub mod inputs;
+pub mod judge;
+pub mod kept;
+pub mod keys;
+pub mod layers;
+pub mod learners;
+pub mod learning;
+pub mod methods;
+pub mod mixture;
+pub mod own;
+pub mod pipeline;
+pub mod processor;
+pub mod recipe;
+pub mod stage;
+pub mod study;
+pub mod sweep;
+pub mod tables;
+pub mod task_data;
+mod titles;
+pub mod variant;
+pub mod verdict;
+pub mod wrong_keys;
+
+pub use error::{Error, Result};

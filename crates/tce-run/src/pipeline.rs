@@ -1,0 +1,260 @@
+//! One variant on one pair of data sets, from rows to scores, in a directory that holds everything about it.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig};
+use tce_augment::mixture::ScoredRows;
+use tce_base::{write_atomically, write_json};
+use tce_learn::{DynamicsConfig, Mode, RowScores};
+use tce_nn::Device;
+use tce_zoo::actors::{Arena, Evaluation};
+
+use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
+use crate::error::{Error, Result};
+use crate::expand::single_stage;
+use crate::expand::{Generated, expand, label_models};
+use crate::inputs::{InputSpec, Inputs};
+use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
+use crate::methods::{closeness, row_scores};
+use crate::mixture::{distances, extra_rows};
+use crate::stage::Stage;
+
+/// The outcome of a variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// The variant's name, or what the user called the run.
+    pub name: String,
+    /// Whether the learner is the public code's or the paper's, where they differ.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mode: Option<Mode>,
+    /// The seeds, one member each.
+    pub seeds: Vec<u64>,
+    /// Normalised score per seed; None if its policy could not be judged. Empty without a simulator.
+    pub scores: Vec<Option<f64>>,
+    /// Learning and evaluation.
+    pub learned: Learned,
+    /// Rows that joined the target rows, per member.
+    pub extra_rows: usize,
+    /// The generated rows, per member; empty if there are none.
+    pub generated: Vec<Generated>,
+    /// Seconds from data to scores, without stages that were there already.
+    pub seconds: f64,
+    /// Where everything is.
+    pub directory: PathBuf,
+    /// The files of the target's and the source's rows, if it had any, as they were called at the time.
+    #[serde(default)]
+    pub data: Vec<PathBuf>,
+}
+
+impl Summary {
+    /// The policies' files, one per seed.
+    pub fn policies(&self) -> Vec<PathBuf> {
+        self.seeds.iter().map(|seed| self.directory.join(policy_file(*seed))).collect()
+    }
+}
+
+/// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
+#[derive(Serialize)]
+struct RunSpec<'a> {
+    inputs: InputSpec,
+    seeds: &'a [u64],
+    mixture: &'a MixtureConfig,
+    learner: serde_json::Value,
+    evaluation: &'a EvaluationConfig,
+    generator: Option<&'a GeneratorConfig>,
+    filter: Option<&'a FilterConfig>,
+    labels: Option<&'a LabelsConfig>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dynamics: Option<&'a DynamicsConfig>,
+    joint: Option<serde_json::Value>,
+}
+
+impl<'a> RunSpec<'a> {
+    fn new(inputs: &Inputs, config: &'a Config, seeds: &'a [u64]) -> Self {
+        let two_stages = config.mixture.generated == GeneratedRows::Tce;
+        let relabelled = config.mixture.source == SourceRows::Relabelled;
+        Self {
+            inputs: inputs.spec_imitated(config.needs_source(), &config.target),
+            seeds,
+            mixture: &config.mixture,
+            learner: config.learner.used(),
+            evaluation: &config.evaluation,
+            generator: two_stages.then_some(&config.generator),
+            filter: two_stages.then_some(&config.filter),
+            labels: (two_stages || relabelled).then_some(&config.labels),
+            dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
+            joint: used_of_single_stage(&config.joint, config.mixture.generated, config.learner.algorithm),
+        }
+    }
+}
+
+/// What a run says about its policies: `result.json`.
+#[derive(Serialize)]
+struct Outcome<'a> {
+    seeds: &'a [u64],
+    scores: &'a [Option<f64>],
+    evaluations: &'a [Evaluation],
+}
+
+impl Config {
+    /// Whether source rows are looked at, in any stage.
+    pub fn needs_source(&self) -> bool {
+        let generating = match self.mixture.generated {
+            GeneratedRows::None | GeneratedRows::Synther => false,
+            GeneratedRows::Tce => self.generator.source_states || self.generator.rows == 0 || self.filter.by_dynamics(),
+            GeneratedRows::Dmc => true,
+        };
+        generating || self.mixture.source != SourceRows::None || self.row_scores() == RowScores::Density
+    }
+
+    /// Which distances of source rows decide, in the mixture or in the learner, if any.
+    pub fn distances(&self) -> Option<SourceRows> {
+        match self.mixture.source {
+            kind @ (SourceRows::Nearest | SourceRows::Transport) => Some(kind),
+            SourceRows::All if self.source_alone() && self.row_scores() == RowScores::Transport => {
+                Some(SourceRows::Transport)
+            }
+            _ => None,
+        }
+    }
+
+    /// By which numbers the learner chooses among other rows.
+    fn row_scores(&self) -> RowScores {
+        self.learner.algorithm.about().scores
+    }
+
+    /// Whether the rows besides the target's are the source's, as they are.
+    fn source_alone(&self) -> bool {
+        self.mixture.source == SourceRows::All && self.mixture.generated == GeneratedRows::None
+    }
+
+    /// The number of every source row by which the learner chooses, where it is computed once for all seeds.
+    fn source_scores(&self, inputs: &Inputs, root: &Path) -> Result<Option<Arc<Vec<f32>>>> {
+        match self.row_scores() {
+            RowScores::Density => Ok(Some(Arc::new(single_stage::scores(inputs, &self.joint.scores, root)?.source))),
+            RowScores::Transport if self.source_alone() => {
+                Ok(Some(closeness(distances(inputs, SourceRows::Transport, root)?)))
+            }
+            _ => Ok(None),
+        }
+    }
+}
+
+/// Runs `config` on `inputs`, or takes the result from its directory under `root` if it is there.
+pub fn run(
+    name: &str,
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    place: &str,
+    device: &Device,
+) -> Result<Summary> {
+    inputs.ensure_episodes(&config.learner)?;
+    let generated = config.mixture.generated != GeneratedRows::None;
+    let relabelled = config.mixture.source == SourceRows::Relabelled;
+    let spec = RunSpec::new(inputs, config, seeds);
+    let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
+    if let Some(summary) = stage.summary::<Summary>()? {
+        tce_base::note!("{name}: done before, in {}", stage.directory().display());
+        return Ok(summary);
+    }
+    let started = Instant::now();
+    tce_base::note!("{name}: {}", stage.directory().display());
+    let attempt = stage.attempt()?;
+    write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
+    let mut files = vec!["config.toml".to_owned()];
+
+    let (mut reports, mut tables) = (Vec::new(), None);
+    if generated {
+        let expansion = expand(inputs, config, seeds, root, device)?;
+        files.extend(expansion.link_into(&attempt)?);
+        reports = expansion.reports;
+        let scored = expansion.tables.into_iter().zip(expansion.scores);
+        tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
+    }
+    let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
+    let scores = config.source_scores(inputs, root)?;
+    let extra = extra_rows(inputs, config, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
+    drop((tables, models));
+
+    if let Some(choice) = inputs.choice(&config.target) {
+        tce_base::note!("{name}: {}", choice.reason);
+    }
+    let data = members(inputs, config, extra.as_deref(), seeds)?;
+    let arena = match (inputs.agent, inputs.shift) {
+        (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
+        _ => None,
+    };
+    let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
+    drop(extra);
+    let place = (attempt.directory(), attempt.key());
+    tce_base::begin_step(&crate::course::learning(name));
+    let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
+        save_policies(policies, seeds, attempt.directory(), inputs)?;
+        files.extend(seeds.iter().map(|&seed| policy_file(seed)));
+        Ok(())
+    })?;
+    let summary = Summary {
+        name: name.to_owned(),
+        mode: config.learner.mode(),
+        seeds: seeds.to_vec(),
+        scores: learned.scores(),
+        learned,
+        extra_rows: extra_count,
+        generated: reports,
+        seconds: started.elapsed().as_secs_f64(),
+        directory: stage.directory().to_owned(),
+        data: inputs.files(),
+    };
+    // Without times, so that two copies of a run have the same bytes.
+    let result = "result.json".to_owned();
+    write_json(
+        &attempt.file(&result),
+        &Outcome { seeds, scores: &summary.scores, evaluations: &summary.learned.evaluations },
+    )?;
+    files.push(result);
+    attempt.finish(&files, &summary)?;
+    Ok(summary)
+}
+
+/// What every member learns from: the target's rows, and its `extra` ones.
+fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
+    // Who models the dynamics has no use for a terminal row without a successor.
+    let target = match config.learner.algorithm.about().successors {
+        true => inputs.imitated(&config.target),
+        false => inputs.learned_from(&config.target),
+    };
+    let target = Arc::new(target.into_owned());
+    let mut trajectories = vec![target.clone()];
+    if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
+        // Generated rows among them are no trajectories.
+        let generated = config.mixture.generated != GeneratedRows::None;
+        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
+    }
+    let scores = |rows: &ScoredRows| match &rows.scores {
+        Some(scores) => Ok(Some(scores.clone())),
+        // Generated rows among them are each seed's own.
+        None => row_scores(config, &target, &rows.rows),
+    };
+    let scores = extra.iter().copied().flatten().map(scores).collect::<Result<Vec<_>>>()?;
+    let data = |(m, &seed): (usize, &u64)| MemberData {
+        seed,
+        target: target.clone(),
+        extra: extra.map(|e| e[m].rows.clone()),
+        row_scores: scores.get(m).cloned().flatten(),
+        trajectories: trajectories.clone(),
+    };
+    Ok(seeds.iter().enumerate().map(data).collect())
+}
+
+/// `n` seeds from `first` on.
+pub fn seeds(first: u64, n: usize) -> Result<Vec<u64>> {
+    if n == 0 {
+        return Err(Error::Usage("--seeds must be at least 1".into()));
+    }
+    Ok((first..first + n as u64).collect())
+}

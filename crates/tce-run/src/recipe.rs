@@ -1,0 +1,128 @@
+//! Which preset a finished run is of. A run's folder keeps its settings and not the name of the preset that they came from, so that the
+//! preset is found again: it is the one that fewest settings differ from.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use clap::ValueEnum;
+use tce_data::Task;
+use tce_report::{Budget, Recipe, RunFolder};
+
+use crate::config::Config;
+use crate::layers::{Layered, Preset};
+use crate::variant::Variant;
+
+/// A preset for a task and a variant.
+struct Known {
+    name: String,
+    settings: BTreeMap<String, String>,
+    config: Config,
+}
+
+/// Finds recipes. A preset's settings are worked out once for a task and a variant, and a recipe once for all seeds.
+#[derive(Default)]
+pub struct Recipes {
+    presets: BTreeMap<(String, String), Vec<Known>>,
+    found: BTreeMap<(String, String, String, bool), Arc<Recipe>>,
+}
+
+/// Every setting by its full name.
+fn flat(table: &toml::Table, prefix: &str, out: &mut BTreeMap<String, String>) {
+    for (key, value) in table {
+        let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        match value {
+            toml::Value::Table(inner) => flat(inner, &name, out),
+            value => {
+                out.insert(name, value.to_string());
+            }
+        }
+    }
+}
+
+fn settings(text: &str) -> BTreeMap<String, String> {
+    let mut out = BTreeMap::new();
+    if let Ok(table) = text.parse::<toml::Table>() {
+        flat(&table, "", &mut out);
+    }
+    out
+}
+
+fn budget(config: &Config, mixed: bool) -> Budget {
+    Budget { learner: config.learner.algorithm.about().name.to_owned(), updates: config.learner.steps(mixed) }
+}
+
+fn presets(task: Task, variant: Variant) -> Vec<Known> {
+    let known = |preset: &Preset| {
+        let config = Layered::new(*preset, Some(task), Some(variant), None, &[]).and_then(|l| l.config()).ok()?;
+        let name = preset.to_possible_value()?.get_name().to_owned();
+        Some(Known { name, settings: settings(&config.to_toml()), config })
+    };
+    [Preset::Default, Preset::Quick, Preset::Paper].iter().filter_map(known).collect()
+}
+
+/// What differs, as `learner.steps = 60 (12000)`; what only one of them has is another version's and no difference. None if they have less
+/// than half of the preset's settings in common.
+fn changes(own: &BTreeMap<String, String>, preset: &BTreeMap<String, String>) -> Option<Vec<String>> {
+    let common: Vec<_> = preset.iter().filter_map(|(key, value)| Some((key, own.get(key)?, value))).collect();
+    if 2 * common.len() < preset.len() {
+        return None;
+    }
+    let differ = common.into_iter().filter(|(_, a, b)| a != b);
+    Some(differ.map(|(key, a, b)| format!("{key} = {a} ({b})")).collect())
+}
+
+impl Recipes {
+    /// The recipe of a run of `variant`, as its folder is called.
+    pub fn of(&mut self, task: Task, variant: &str, folder: &RunFolder) -> Arc<Recipe> {
+        let mixed = folder.extra_rows > 0;
+        let key = (task.to_string(), variant.to_owned(), folder.config_hash.clone(), mixed);
+        if let Some(recipe) = self.found.get(&key) {
+            return recipe.clone();
+        }
+        let learner = toml::from_str::<Config>(&folder.config).ok().map(|c| budget(&c, mixed));
+        let mut recipe = Recipe { learner, ..Recipe::default() };
+        if let Ok(variant) = Variant::from_str(variant, false) {
+            let place = (key.0.clone(), key.1.clone());
+            let known = self.presets.entry(place).or_insert_with(|| presets(task, variant));
+            let own = settings(&folder.config);
+            let nearest = known.iter().filter_map(|k| Some((k, changes(&own, &k.settings)?)));
+            if let Some((preset, changed)) = nearest.min_by_key(|(_, changed)| changed.len()) {
+                (recipe.preset, recipe.changed) = (Some(preset.name.clone()), changed);
+            }
+            recipe.paper = known.iter().find(|k| k.name == "paper").map(|k| budget(&k.config, mixed));
+        }
+        let recipe = Arc::new(recipe);
+        self.found.insert(key, recipe.clone());
+        recipe
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn task() -> Task {
+        "hopper-morph:medium->expert".parse().unwrap()
+    }
+
+    /// The settings of `preset` with `sets`, recognised.
+    fn found(preset: Preset, variant: Variant, sets: &[&str]) -> Option<(String, Vec<String>)> {
+        let sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
+        let own = Layered::new(preset, Some(task()), Some(variant), None, &sets).unwrap().config().unwrap().to_toml();
+        let known = presets(task(), variant);
+        let nearest = known.iter().filter_map(|k| Some((k.name.clone(), changes(&settings(&own), &k.settings)?)));
+        nearest.min_by_key(|(_, changed)| changed.len())
+    }
+
+    #[test]
+    fn presets_are_recognised_by_their_settings() {
+        for (preset, name) in [(Preset::Default, "default"), (Preset::Quick, "quick"), (Preset::Paper, "paper")] {
+            for variant in [Variant::TceOg, Variant::Bc, Variant::Igdf] {
+                assert_eq!(found(preset, variant, &[]), Some((name.to_owned(), vec![])), "{variant}");
+            }
+        }
+        let changed = found(Preset::Quick, Variant::TceOg, &["learner.steps=60"]);
+        assert_eq!(changed, Some(("quick".into(), vec!["learner.steps = 60 (12000)".into()])));
+        assert_eq!(changes(&settings("a = 1"), &presets(task(), Variant::Bc)[0].settings), None);
+    }
+}

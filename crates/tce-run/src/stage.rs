@@ -1,0 +1,377 @@
+//! Stages: a directory per finished piece of work, named by the hash of everything that decides its content.
+//!
+//! A stage is done when its `done.json` exists, which lists what the stage holds. A run that needs a stage takes it if it is
+//! done and makes it otherwise; two runs with the same needs share it.
+//!
+//! Work happens in a directory of its own ([`Attempt`]), so that copies of a run do not meet: on a cluster, a job that was given up
+//! for dead may still be alive beside its successor. A new attempt takes over what an earlier one left: checkpoints, metrics and
+//! sampled chunks. The end of an attempt is one `link(2)` of a complete `done.json`: the first one wins. A later one with the same bytes
+//! changes nothing; one with other bytes is a fault of determinism, which is kept as `fault-*.json` and reported.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::SystemTime;
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use tce_base::metrics::Metrics;
+use tce_base::{FileError, Owner, PROGRAM, link_first, read_if_there, sha256_file, sha256_hex, write_json};
+use tce_nn::{Checkpoints, Device};
+
+use crate::error::{Error, Result};
+use crate::processor::Processor;
+
+/// Changes when the same specification would give other bytes.
+const FORMAT: u32 = 4;
+/// Where attempts are, in a stage.
+pub(crate) const ATTEMPTS: &str = "attempts";
+
+/// What marks a stage as done.
+#[derive(Serialize, Deserialize)]
+struct Done<T> {
+    /// The program that wrote it.
+    program: String,
+    /// The attempt that made it.
+    attempt: String,
+    /// SHA-256 of every file of the stage.
+    files: BTreeMap<String, String>,
+    /// The stage's own summary.
+    summary: T,
+}
+
+/// The place of one stage.
+#[derive(Clone, Debug)]
+pub struct Stage {
+    directory: PathBuf,
+    key: String,
+}
+
+impl Stage {
+    /// The stage `name` for `spec` under `root`. The specification is kept beside the results. What another device than the CPU
+    /// computes is a stage of its own: it has other bytes.
+    pub fn open<S: Serialize>(root: &Path, name: &str, spec: &S, device: &Device) -> Result<Self> {
+        let mut spec = serde_json::json!({ "format": FORMAT, "stage": name.rsplit('/').next(), "spec": spec });
+        Processor::from(device).sign(&mut spec);
+        let key = sha256_hex(spec.to_string().as_bytes());
+        let directory = root.join(format!("{name}-{}", &key[..12]));
+        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        let path = directory.join("spec.json");
+        if !path.exists() {
+            write_json(&path, &spec)?;
+        }
+        Ok(Self { directory, key })
+    }
+
+    /// Where the stage's files are.
+    pub fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    /// The directory's own name, which holds the hash of the specification.
+    pub fn name(&self) -> String {
+        self.directory.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned())
+    }
+
+    /// A file of the finished stage.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    fn done<T: DeserializeOwned>(&self) -> Result<Option<Done<T>>> {
+        let path = self.file("done.json");
+        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
+        serde_json::from_slice(&bytes)
+            .map(Some)
+            .map_err(|e| Error::Failed(format!("{}: {e}; remove the directory to do the stage again", path.display())))
+    }
+
+    /// The summary, if the stage is done and its files are what they were.
+    ///
+    /// # Errors
+    /// If a file of a finished stage was changed or removed.
+    pub fn summary<T: DeserializeOwned>(&self) -> Result<Option<T>> {
+        let Some(done) = self.done::<T>()? else { return Ok(None) };
+        // The winner may have been killed before it gave its files their places.
+        self.place(&done.attempt, done.files.keys());
+        let attempt = self.directory.join(ATTEMPTS).join(&done.attempt);
+        if attempt.exists() && Owner::of(&attempt).is_some_and(|owner| owner.dead()) {
+            self.clear(&done.attempt);
+        }
+        for (name, expected) in &done.files {
+            let file = self.file(name);
+            let found = sha256_file(&file)?;
+            if found != *expected {
+                return Err(Error::Failed(format!(
+                    "{}: SHA-256 {found}, expected {expected}: the file was changed since the stage was done; remove {} to \
+                     do it again",
+                    file.display(),
+                    self.directory.display()
+                )));
+            }
+        }
+        Ok(Some(done.summary))
+    }
+
+    /// Gives files of the winning attempt their places in the stage; what is in place already stays.
+    fn place<'a>(&self, attempt: &str, files: impl Iterator<Item = &'a String>) {
+        let from = self.directory.join(ATTEMPTS).join(attempt);
+        for name in files {
+            let (from, to) = (from.join(name), self.file(name));
+            if !to.exists() && fs::hard_link(&from, &to).is_err() && !to.exists() {
+                // A file system without hard links: the attempt's file is complete, so that a rename is whole, too.
+                let _ = fs::rename(&from, &to);
+            }
+        }
+    }
+
+    /// The last steps of the winning attempt, after its files are in place: metrics, which are for eyes and no part of the result,
+    /// and its end.
+    fn clear(&self, attempt: &str) {
+        let directory = self.directory.join(ATTEMPTS).join(attempt);
+        self.place(attempt, std::iter::once(&"metrics.jsonl".to_owned()));
+        let _ = fs::rename(directory.join("tensorboard"), self.file("tensorboard"));
+        self.discard(attempt);
+    }
+
+    /// Removes an attempt.
+    fn discard(&self, attempt: &str) {
+        let _ = fs::remove_dir_all(self.directory.join(ATTEMPTS).join(attempt));
+        // Goes away with the last attempt.
+        let _ = fs::remove_dir(self.directory.join(ATTEMPTS));
+    }
+
+    /// Begins, or goes on with, the work of this stage.
+    ///
+    /// # Errors
+    /// If the directory cannot be made.
+    pub fn attempt(&self) -> Result<Attempt> {
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        let n = COUNT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("{}.{n}", Owner::this());
+        let attempts = self.directory.join(ATTEMPTS);
+        fs::create_dir_all(&attempts).map_err(|e| FileError::new(&attempts, "create the directory", e))?;
+        let directory = attempts.join(&name);
+        let mut others: Vec<_> = fs::read_dir(&attempts)
+            .map_err(|e| FileError::new(&attempts, "read the directory", e))?
+            .flatten()
+            .map(|entry| (newest(&entry.path()), entry.path()))
+            .collect();
+        others.sort();
+        let mut taken = false;
+        for (_, other) in others.into_iter().rev() {
+            let dead = Owner::of(&other).is_some_and(|owner| owner.dead());
+            match (taken, dead) {
+                // Its owner is dead, so that nobody else writes there; of two that want it, one gets it.
+                (false, true) => taken = fs::rename(&other, &directory).is_ok(),
+                // Perhaps alive, on another machine say. A copy of the same training is at another point of the same way.
+                (false, false) => taken = copy(&other, &directory).is_ok(),
+                (true, true) => drop(fs::remove_dir_all(&other)),
+                (true, false) => {}
+            }
+        }
+        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        Ok(Attempt { stage: self.clone(), name, directory })
+    }
+}
+
+/// One try at a stage, in a directory of its own.
+#[derive(Debug)]
+pub struct Attempt {
+    stage: Stage,
+    name: String,
+    directory: PathBuf,
+}
+
+impl Attempt {
+    /// Where the work happens.
+    pub fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    /// A file in the making.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.directory.join(name)
+    }
+
+    /// The hash of the specification, which checkpoints and chunks of this stage carry.
+    pub fn key(&self) -> &str {
+        &self.stage.key
+    }
+
+    /// The checkpoints of the training `name`.
+    pub fn checkpoints(&self, name: &str) -> Result<Checkpoints> {
+        Ok(Checkpoints::open(&self.directory, name, &self.stage.key)?)
+    }
+
+    /// The metrics so far, without those of steps that will come again: `keep` tells by kind and step.
+    pub fn metrics(&self, keep: impl Fn(&str, u64) -> bool) -> Result<Metrics> {
+        Ok(Metrics::resume(&self.directory, keep)?)
+    }
+
+    /// Makes `name` in this attempt the same file as `from`, without a copy where the file system allows it.
+    pub fn link(&self, from: &Path, name: &str) -> Result<()> {
+        let to = self.file(name);
+        if to.exists() {
+            fs::remove_file(&to).map_err(|e| FileError::new(&to, "replace", e))?;
+        }
+        fs::hard_link(from, &to)
+            .or_else(|_| fs::copy(from, &to).map(drop))
+            .map_err(|e| FileError::new(&to, "link or copy", e).into())
+    }
+
+    /// Marks the stage as done with `files` of this attempt, unless another attempt was first.
+    ///
+    /// # Errors
+    /// If another attempt was first with other bytes; if a file cannot be read or written.
+    pub fn finish<T: Serialize>(self, files: &[String], summary: T) -> Result<()> {
+        let hashes = files.iter().map(|f| Ok((f.clone(), sha256_file(&self.file(f))?))).collect::<Result<_>>()?;
+        let done = Done { program: PROGRAM.into(), attempt: self.name.clone(), files: hashes, summary };
+        let own = self.file("done.json");
+        write_json(&own, &done)?;
+        if link_first(&own, &self.stage.file("done.json"))? {
+            self.stage.place(&self.name, files.iter());
+            self.stage.clear(&self.name);
+        } else {
+            let winner = self.stage.done::<serde_json::Value>()?;
+            if let Some(winner) = winner.filter(|w| w.files != done.files) {
+                let fault = self.stage.file(&format!("fault-{}.json", self.name));
+                let value = serde_json::json!({
+                    "first": { "program": winner.program, "attempt": winner.attempt, "files": winner.files },
+                    "later": { "program": done.program, "attempt": done.attempt, "files": done.files },
+                });
+                write_json(&fault, &value)?;
+                return Err(Error::Failed(format!(
+                    "{}: two attempts at the same work gave different bytes; the first one's result stays, and {} holds both \
+                     lists of hashes. This is a fault of determinism: were the two made by different builds or processors?",
+                    self.stage.directory.display(),
+                    fault.display()
+                )));
+            }
+            self.stage.discard(&self.name);
+        }
+        Ok(())
+    }
+}
+
+/// The time of the last change below `directory`.
+fn newest(directory: &Path) -> SystemTime {
+    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
+    let times = entries.filter_map(|e| e.metadata().and_then(|m| m.modified()).ok());
+    times.max().unwrap_or(SystemTime::UNIX_EPOCH)
+}
+
+/// Copies what is in `from` into `to`; on a failure there is no `to`.
+fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
+    fn all(from: &Path, to: &Path) -> std::io::Result<()> {
+        fs::create_dir_all(to)?;
+        for entry in fs::read_dir(from)? {
+            let entry = entry?;
+            let to = to.join(entry.file_name());
+            if entry.file_type()?.is_dir() {
+                all(&entry.path(), &to)?;
+            } else if !entry.file_name().to_string_lossy().ends_with(".part") {
+                match fs::copy(entry.path(), to) {
+                    // Its owner is at work and has replaced or removed it.
+                    Err(e) if e.kind() != ErrorKind::NotFound => return Err(e),
+                    _ => {}
+                }
+            }
+        }
+        Ok(())
+    }
+    all(from, to).inspect_err(|_| drop(fs::remove_dir_all(to)))
+}
+
+/// SHA-256 of the files of the finished stage in `directory`, as its `done.json` lists them.
+///
+/// # Errors
+/// If the stage is not done, or its record is damaged.
+pub fn files_of(directory: &Path) -> Result<BTreeMap<String, String>> {
+    let stage = Stage { directory: directory.to_owned(), key: String::new() };
+    let done = stage.done::<serde_json::Value>()?;
+    done.map(|d| d.files).ok_or_else(|| Error::missing(directory, "no done.json: the stage is not finished"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stage(root: &Path, spec: u32) -> Stage {
+        Stage::open(root, "stages/test", &("spec", spec), &tce_nn::cpu()).unwrap()
+    }
+
+    fn make(attempt: Attempt, content: &[u8]) -> Result<()> {
+        fs::write(attempt.file("rows"), content).unwrap();
+        attempt.finish(&["rows".into()], 7u32)
+    }
+
+    #[test]
+    fn a_stage_is_done_once_and_damage_is_noticed() {
+        let root = tempfile::tempdir().unwrap();
+        let first = stage(root.path(), 1);
+        assert_eq!(first.summary::<u32>().unwrap(), None);
+        make(first.attempt().unwrap(), b"data").unwrap();
+        assert!(!first.directory().join(ATTEMPTS).exists());
+        let again = stage(root.path(), 1);
+        assert_eq!(again.summary::<u32>().unwrap(), Some(7));
+        assert_eq!(stage(root.path(), 2).summary::<u32>().unwrap(), None);
+        fs::write(first.file("rows"), b"DATA").unwrap();
+        let message = again.summary::<u32>().unwrap_err().to_string();
+        assert!(message.contains("rows") && message.contains("changed"), "{message}");
+    }
+
+    #[test]
+    fn of_two_copies_the_first_wins_and_a_difference_is_a_fault() {
+        let root = tempfile::tempdir().unwrap();
+        let s = stage(root.path(), 1);
+        let [a, b, c] = [(); 3].map(|()| s.attempt().unwrap());
+        make(b, b"data").unwrap();
+        make(a, b"data").unwrap();
+        assert_eq!(s.summary::<u32>().unwrap(), Some(7));
+        let message = make(c, b"other").unwrap_err().to_string();
+        assert!(message.contains("fault of determinism"), "{message}");
+        assert_eq!(fs::read(s.file("rows")).unwrap(), b"data");
+        assert_eq!(s.summary::<u32>().unwrap(), Some(7));
+    }
+
+    #[test]
+    fn a_winner_that_dies_before_it_places_its_files_has_won() {
+        let root = tempfile::tempdir().unwrap();
+        let s = stage(root.path(), 1);
+        let attempt = s.attempt().unwrap();
+        fs::write(attempt.file("rows"), b"data").unwrap();
+        let files = BTreeMap::from([("rows".to_owned(), sha256_hex(b"data"))]);
+        let done = Done { program: "tce".into(), attempt: attempt.name.clone(), files, summary: 7u32 };
+        write_json(&s.file("done.json"), &done).unwrap();
+        drop(attempt);
+        assert_eq!(s.summary::<u32>().unwrap(), Some(7));
+        assert!(s.file("rows").exists());
+    }
+
+    #[test]
+    fn a_dead_process_is_inherited_and_a_living_one_is_copied() {
+        let root = tempfile::tempdir().unwrap();
+        let s = stage(root.path(), 1);
+        let alive = s.attempt().unwrap();
+        fs::write(alive.file("note"), b"alive").unwrap();
+        let copy = s.attempt().unwrap();
+        assert_eq!(fs::read(copy.file("note")).unwrap(), b"alive");
+        assert!(alive.file("note").exists());
+        for attempt in [&alive, &copy] {
+            fs::remove_dir_all(attempt.directory()).unwrap();
+        }
+
+        // A process cannot have started at 1: whoever had this number is gone.
+        let this = Owner::this().to_string();
+        let (machine_and_process, _) = this.rsplit_once('.').unwrap();
+        let left = s.directory().join(ATTEMPTS).join(format!("{machine_and_process}.1.0"));
+        fs::create_dir_all(&left).unwrap();
+        fs::write(left.join("note"), b"dead").unwrap();
+        let heir = s.attempt().unwrap();
+        assert_eq!(fs::read(heir.file("note")).unwrap(), b"dead");
+        assert!(!left.exists());
+    }
+}

@@ -1,0 +1,452 @@
+//! The immutable list of work that a description is turned into.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use tce_base::{FileError, PROGRAM, sha256_file, sha256_hex};
+use tce_data::{Task, main_file};
+
+use crate::config::{Config, GeneratedRows, SourceRows, used_of_single_stage};
+use crate::error::{Error, Result};
+use crate::inputs::{DataArgs, ensure_data};
+use crate::layers::{Layered, Preset};
+use crate::variant::Variant;
+
+/// More runs than anybody has machines for are a slip of the finger.
+const MOST_RUNS: u64 = 100_000;
+/// Changes when manifests of before cannot be read.
+const FORMAT: u32 = 1;
+
+/// A sweep's description, `sweep.toml`: tasks × variants × overrides × seeds.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// Tasks, `*` standing for anything: `hopper-*:medium->*`.
+    pub tasks: Vec<String>,
+    /// Methods.
+    pub variants: Vec<Variant>,
+    /// Whether the floors are run beside them.
+    #[serde(default = "yes")]
+    pub floors: bool,
+    /// Seeds, one run each.
+    #[serde(default = "one")]
+    pub seeds: u64,
+    /// The first seed.
+    #[serde(default)]
+    pub first_seed: u64,
+    /// Where the configuration starts.
+    #[serde(default)]
+    pub preset: Preset,
+    /// A configuration file on top of it, relative to the description.
+    pub config: Option<PathBuf>,
+    /// Single keys on top of that, `"learner.steps=100_000"`.
+    #[serde(default)]
+    pub set: Vec<String>,
+    /// Collect what is not given by the zoo's actors only.
+    #[serde(default)]
+    pub from_zoo: bool,
+    /// Data files of a task, relative to the description.
+    #[serde(default)]
+    pub data: BTreeMap<Task, Files>,
+    /// Further settings, each one more column; none means one column without a name.
+    #[serde(default)]
+    pub overrides: Vec<Override>,
+}
+
+/// Data files of a task.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Files {
+    /// Source data.
+    pub source: Option<PathBuf>,
+    /// Target data.
+    pub target: Option<PathBuf>,
+}
+
+/// A column of its own.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Override {
+    /// Its name.
+    pub name: String,
+    /// What it changes.
+    pub set: Vec<String>,
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn one() -> u64 {
+    1
+}
+
+/// What a piece of work is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// Source rows from the zoo.
+    Source,
+    /// Target rows from the zoo.
+    Target,
+    /// Distances of source rows to the target's, which several runs share.
+    Distances,
+    /// Networks, label models and generated rows, which several runs share.
+    Expand,
+    /// A policy and its score.
+    Run,
+}
+
+/// One piece of work.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Its place in the manifest.
+    pub index: usize,
+    /// Hash of all that decides its outcome.
+    pub id: String,
+    /// What it is.
+    pub kind: Kind,
+    /// The task, or the first of those that share it.
+    pub task: Task,
+    /// The method, for runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub variant: Option<Variant>,
+    /// The override's name, for runs of one.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub label: String,
+    /// The seed.
+    pub seed: u64,
+    /// Hash of its configuration.
+    pub config: String,
+    /// Indices of the work that should be done before. Without it the work is done all the same, only twice.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub needs: Vec<usize>,
+}
+
+impl Entry {
+    /// The method's column in tables.
+    pub fn column(&self) -> String {
+        let variant = self.variant.map(Variant::name).unwrap_or_default();
+        if self.label.is_empty() { variant } else { format!("{variant} {}", self.label) }
+    }
+}
+
+impl fmt::Display for Entry {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { index, kind, task, seed, .. } = self;
+        match kind {
+            Kind::Source => write!(f, "{index}: source rows, {}-{}", task.agent, task.source),
+            Kind::Target => write!(f, "{index}: target rows, {}-{}-{}", task.agent, task.shift, task.target),
+            Kind::Distances => write!(f, "{index}: distances of source rows, {task}"),
+            Kind::Expand => write!(f, "{index}: generated rows, {task}, seed {seed}"),
+            Kind::Run => write!(f, "{index}: {}, {task}, seed {seed}", self.column()),
+        }
+    }
+}
+
+/// What holds for all pieces of work.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    format: u32,
+    /// The sweep's name: its description's.
+    pub name: String,
+    /// The program that planned it.
+    pub program: String,
+    /// Collect what is not given by the zoo's actors only.
+    pub from_zoo: bool,
+    /// Data files.
+    pub data: BTreeMap<Task, Files>,
+    /// SHA-256 of the data files, when the sweep was planned.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub hashes: BTreeMap<PathBuf, String>,
+    /// Configurations, TOML, by their hash.
+    pub configs: BTreeMap<String, String>,
+    /// Pieces of work.
+    pub entries: usize,
+}
+
+impl Header {
+    /// Where the data of a task come from.
+    pub(super) fn data_of(&self, task: Task) -> DataArgs {
+        let Files { source, target } = self.data.get(&task).cloned().unwrap_or_default();
+        DataArgs { source, target, from_zoo: self.from_zoo, out: PathBuf::new() }
+    }
+}
+
+/// The list of work of a sweep.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Manifest {
+    /// What holds for all of it.
+    pub header: Header,
+    /// The work.
+    pub entries: Vec<Entry>,
+}
+
+impl Manifest {
+    /// The work of a description.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a description that cannot be read, an unknown key, task or setting, or files that are not there.
+    pub fn plan(path: &Path) -> Result<Self> {
+        let failed = |e: &dyn fmt::Display| Error::Usage(format!("{}: {e}", path.display()));
+        let text = fs::read_to_string(path).map_err(|e| Error::Usage(FileError::new(path, "read", e).to_string()))?;
+        let description: Description = toml::from_str(&text).map_err(|e| failed(&e))?;
+        let base = path.parent().unwrap_or(Path::new("."));
+        let tasks = tasks(&description.tasks).map_err(|e| failed(&e))?;
+        if description.variants.is_empty() || description.seeds == 0 {
+            return Err(failed(&"there is nothing to run; give at least one task, one of `variants`, and seeds > 0"));
+        }
+        let (mut data, mut hashes) = (description.data.clone(), BTreeMap::new());
+        for (task, files) in &mut data {
+            for file in files.source.iter_mut().chain(&mut files.target) {
+                let full = main_file(&base.join(&*file));
+                *file = full.canonicalize().map_err(|e| failed(&format!("data of {task}: {}: {e}", full.display())))?;
+                if !hashes.contains_key(file) {
+                    hashes.insert(file.clone(), sha256_file(file)?);
+                }
+            }
+        }
+        let mut variants = description.variants.clone();
+        if description.floors {
+            variants.extend(Variant::FLOORS);
+        }
+        let mut seen = BTreeSet::new();
+        variants.retain(|v| seen.insert(*v));
+        let plain = [Override { name: String::new(), set: Vec::new() }];
+        let overrides = if description.overrides.is_empty() { &plain[..] } else { &description.overrides };
+        let file = description.config.as_ref().map(|c| base.join(c));
+
+        let header = Header {
+            format: FORMAT,
+            name: path.file_stem().map_or_else(String::new, |s| s.to_string_lossy().into_owned()),
+            program: PROGRAM.into(),
+            from_zoo: description.from_zoo,
+            data,
+            hashes,
+            configs: BTreeMap::new(),
+            entries: 0,
+        };
+        let runs = [tasks.len(), variants.len(), overrides.len()].iter().product::<usize>() as u64;
+        if description.seeds > MOST_RUNS / runs || description.first_seed.checked_add(description.seeds).is_none() {
+            return Err(failed(&format!("{runs} x {} runs; a sweep has at most {MOST_RUNS}", description.seeds)));
+        }
+        let mut plan = Self { header, entries: Vec::new() };
+        let mut known = BTreeMap::new();
+        // What the data of a task are needed for: with as many source rows, or without a source.
+        let mut wanted = BTreeSet::new();
+        for &task in &tasks {
+            for &variant in &variants {
+                for Override { name, set } in overrides {
+                    let sets = [description.set.clone(), set.clone()].concat();
+                    let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
+                    let config = layered.config()?;
+                    wanted.insert((task, config.needs_source().then_some(config.source.rows)));
+                    for seed in description.first_seed..description.first_seed + description.seeds {
+                        plan.add_run(&mut known, task, variant, name, &config, seed);
+                    }
+                }
+            }
+        }
+        let lacks = |(task, rows): (Task, Option<usize>)| ensure_data(task, &plan.header.data_of(task), rows).err();
+        let lacking: BTreeSet<String> = wanted.into_iter().filter_map(lacks).map(|e| e.to_string()).collect();
+        if !lacking.is_empty() {
+            return Err(Error::Failed(format!(
+                "{}: not all data can be had:\n{}",
+                path.display(),
+                lacking.into_iter().collect::<Vec<_>>().join("\n")
+            )));
+        }
+        Ok(plan.sorted())
+    }
+
+    /// The place of `entry`, which is added unless it is there.
+    fn add(&mut self, known: &mut BTreeMap<String, usize>, entry: Entry) -> usize {
+        *known.entry(entry.id.clone()).or_insert_with(|| {
+            self.entries.push(entry);
+            self.entries.len() - 1
+        })
+    }
+
+    fn add_run(
+        &mut self,
+        known: &mut BTreeMap<String, usize>,
+        task: Task,
+        variant: Variant,
+        label: &str,
+        config: &Config,
+        seed: u64,
+    ) {
+        let text = config.to_toml();
+        let hash = sha256_hex(text.as_bytes())[..16].to_owned();
+        self.header.configs.insert(hash.clone(), text);
+        let (data, from_zoo) = (self.header.data.get(&task).cloned().unwrap_or_default(), self.header.from_zoo);
+        let entry = |kind: Kind, spec: serde_json::Value, seed: u64, needs: Vec<usize>| Entry {
+            index: 0,
+            id: sha256_hex(serde_json::json!({ "kind": kind, "spec": spec }).to_string().as_bytes())[..16].to_owned(),
+            kind,
+            task,
+            variant: None,
+            label: String::new(),
+            seed,
+            config: hash.clone(),
+            needs,
+        };
+        let rows = serde_json::json!([config.source, config.target]);
+        let mut needs = Vec::new();
+        if data.target.is_none() {
+            let spec = serde_json::json!([task.agent, task.shift, task.target, from_zoo]);
+            needs.push(self.add(known, entry(Kind::Target, spec, 0, Vec::new())));
+        }
+        if config.needs_source() && data.source.is_none() {
+            let spec = serde_json::json!([task.agent, task.source, config.source.rows, from_zoo]);
+            needs.push(self.add(known, entry(Kind::Source, spec, 0, Vec::new())));
+        }
+        if let Some(kind) = config.distances() {
+            let spec = serde_json::json!([task, data, from_zoo, rows, kind]);
+            let distances = self.add(known, entry(Kind::Distances, spec, 0, needs.clone()));
+            needs.push(distances);
+        }
+        let generated = config.mixture.generated;
+        if generated != GeneratedRows::None || config.mixture.source == SourceRows::Relabelled {
+            let own = match generated {
+                GeneratedRows::Synther | GeneratedRows::Dmc => {
+                    serde_json::json!(used_of_single_stage(&config.joint, generated, config.learner.algorithm))
+                }
+                GeneratedRows::Tce | GeneratedRows::None => {
+                    let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
+                    let dynamics = config.filter.by_dynamics().then_some(&config.dynamics);
+                    let imitated = config.target.trajectories;
+                    serde_json::json!([config.generator, config.filter, config.labels, lambda, imitated, dynamics])
+                }
+            };
+            let spec = serde_json::json!([task, data, from_zoo, rows, generated, own, seed]);
+            let before = needs.clone();
+            needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
+        }
+        let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
+        let run = entry(Kind::Run, spec, seed, needs);
+        self.add(known, Entry { variant: Some(variant), label: label.to_owned(), ..run });
+    }
+
+    /// Work that others need comes first.
+    fn sorted(mut self) -> Self {
+        let mut order: Vec<usize> = (0..self.entries.len()).collect();
+        order.sort_by_key(|&i| (self.entries[i].kind, i));
+        let mut place = vec![0; order.len()];
+        order.iter().enumerate().for_each(|(new, &old)| place[old] = new);
+        let mut entries: Vec<Entry> = order.iter().map(|&i| self.entries[i].clone()).collect();
+        for (index, entry) in entries.iter_mut().enumerate() {
+            entry.index = index;
+            entry.needs.iter_mut().for_each(|n| *n = place[*n]);
+        }
+        self.header.entries = entries.len();
+        self.entries = entries;
+        self
+    }
+
+    /// As `manifest.jsonl` has it.
+    pub fn to_jsonl(&self) -> String {
+        let line = |value: serde_json::Value| format!("{value}\n");
+        let entries = self.entries.iter().map(|e| line(serde_json::to_value(e).expect("plain data")));
+        std::iter::once(line(serde_json::to_value(&self.header).expect("plain data"))).chain(entries).collect()
+    }
+
+    /// Reads what [`Manifest::to_jsonl`] wrote; `path` is for messages.
+    ///
+    /// # Errors
+    /// If it is damaged, or of another version of the program's manifests.
+    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+        let bad = |line: usize, what: &dyn fmt::Display| {
+            Error::Failed(format!("{}: line {line}: {what}; the file is damaged, plan the sweep again", path.display()))
+        };
+        let mut lines = text.lines().enumerate();
+        let (_, first) = lines.next().ok_or_else(|| bad(1, &"found nothing, expected a header"))?;
+        let header: Header = serde_json::from_str(first).map_err(|e| bad(1, &e))?;
+        if header.format != FORMAT {
+            return Err(Error::Failed(format!(
+                "{}: found format {}, expected {FORMAT}: it was planned by {}; use that program, or plan it again",
+                path.display(),
+                header.format,
+                header.program
+            )));
+        }
+        for (hash, config) in &header.configs {
+            if !sha256_hex(config.as_bytes()).starts_with(hash.as_str()) || hash.len() != 16 {
+                return Err(bad(1, &format!("configuration {hash} is not what it was")));
+            }
+        }
+        let mut entries: Vec<Entry> = Vec::new();
+        for (n, line) in lines {
+            let entry: Entry = serde_json::from_str(line).map_err(|e| bad(n + 1, &e))?;
+            let fits = entry.index == entries.len()
+                && entry.needs.iter().all(|&k| k < entry.index)
+                && header.configs.contains_key(&entry.config)
+                && entry.id.len() == 16
+                && entry.id.bytes().all(|b| b.is_ascii_hexdigit());
+            if !fits {
+                return Err(bad(n + 1, &"an entry out of order, or with an unknown configuration"));
+            }
+            entries.push(entry);
+        }
+        if entries.len() != header.entries {
+            return Err(bad(
+                entries.len() + 1,
+                &format!("found {} entries, expected {}", entries.len(), header.entries),
+            ));
+        }
+        Ok(Self { header, entries })
+    }
+
+    /// The configuration of a piece of work.
+    ///
+    /// # Errors
+    /// If this program's configurations have other keys.
+    pub fn config(&self, entry: &Entry) -> Result<Config> {
+        let text = &self.header.configs[&entry.config];
+        let config: Config = toml::from_str(text).map_err(|e| {
+            Error::Failed(format!("a configuration planned by {} is none of this program's: {e}", self.header.program))
+        })?;
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// The tasks that patterns stand for, in the order of the patterns.
+fn tasks(patterns: &[String]) -> Result<Vec<Task>, String> {
+    let mut out: Vec<Task> = Vec::new();
+    for pattern in patterns {
+        let found: Vec<Task> = if pattern.contains('*') {
+            Task::all()
+                .into_iter()
+                .filter(|t| glob(pattern, &t.to_string()) || glob(pattern, &t.with_arrow()))
+                .collect()
+        } else {
+            vec![pattern.parse()?]
+        };
+        if found.is_empty() {
+            return Err(format!("tasks: `{pattern}` matches none of the 108 tasks ROBOT-SHIFT/SOURCE/TARGET"));
+        }
+        out.extend(found.into_iter().filter(|t| !out.contains(t)).collect::<Vec<_>>());
+    }
+    match out.is_empty() {
+        true => Err("tasks: none".into()),
+        false => Ok(out),
+    }
+}
+
+fn glob(pattern: &str, text: &str) -> bool {
+    match pattern.split_once('*') {
+        None => pattern == text,
+        Some((head, rest)) => text
+            .strip_prefix(head)
+            .is_some_and(|tail| (0..=tail.len()).any(|k| tail.is_char_boundary(k) && glob(rest, &tail[k..]))),
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests;

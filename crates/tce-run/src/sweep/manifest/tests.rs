@@ -1,0 +1,102 @@
+use super::*;
+
+pub fn plan(text: &str) -> Result<Manifest> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("my.toml");
+    fs::write(&path, text).unwrap();
+    Manifest::plan(&path)
+}
+
+pub const TWO: &str = r#"
+    tasks = ["hopper-morph:medium->expert", "hopper-morph:medium->medium"]
+    variants = ["tce-og", "tce-no-reg", "target-source"]
+    seeds = 2
+    preset = "quick"
+"#;
+
+#[test]
+fn runs_share_what_they_need() {
+    let manifest = plan(TWO).unwrap();
+    let count = |kind| manifest.entries.iter().filter(|e| e.kind == kind).count();
+    assert_eq!(count(Kind::Run), 2 * (3 + 5) * 2);
+    // Two methods of one seed learn from the same generated rows.
+    assert_eq!(count(Kind::Expand), 2 * 2);
+    assert_eq!((count(Kind::Source), count(Kind::Target)), (1, 2));
+    for entry in &manifest.entries {
+        assert!(entry.needs.iter().all(|&n| manifest.entries[n].kind < entry.kind), "{entry}");
+    }
+    let generated = manifest.entries.iter().find(|e| e.variant == Some(Variant::TceOg)).unwrap();
+    assert_eq!(generated.needs.len(), 3);
+    let ids: BTreeSet<_> = manifest.entries.iter().map(|e| &e.id).collect();
+    assert_eq!(ids.len(), manifest.entries.len());
+}
+
+#[test]
+fn rivals_share_their_generated_rows() {
+    let manifest = plan(
+        r#"
+        tasks = ["hopper-morph:medium->expert"]
+        variants = ["dmc", "dmc-published", "synther", "tce-og"]
+        floors = false
+        seeds = 2
+        overrides = [
+            { name = "", set = [] },
+            { name = "w", set = ["learner.dmc.cut_off=0.2", "generator.y_max=0.1"] },
+        ]
+        "#,
+    )
+    .unwrap();
+    let needs = |variant: Variant, label: &str, seed: u64| {
+        let run = |e: &&Entry| e.variant == Some(variant) && e.label == label && e.seed == seed;
+        let entry = manifest.entries.iter().find(run).unwrap();
+        let kinds = entry.needs.iter().map(|&n| manifest.entries[n].kind).collect::<Vec<_>>();
+        (entry.needs.last().copied().unwrap(), kinds)
+    };
+    let (dmc, kinds) = needs(Variant::Dmc, "", 0);
+    assert_eq!(kinds, [Kind::Target, Kind::Source, Kind::Expand]);
+    assert_eq!(needs(Variant::DmcPublished, "", 0).0, dmc);
+    // Neither what the learner does with them, nor the keys of another generator, makes other rows.
+    assert_eq!(needs(Variant::Dmc, "w", 0).0, dmc);
+    let (synther, kinds) = needs(Variant::Synther, "", 0);
+    assert_eq!(kinds, [Kind::Target, Kind::Expand], "SynthER looks at no source");
+    assert_eq!(needs(Variant::Synther, "w", 0).0, synther);
+    assert_ne!(needs(Variant::Dmc, "", 1).0, dmc);
+    // dmc and synther, and tce-og under two y_max, of two seeds.
+    assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Expand).count(), 2 * (2 + 2));
+}
+
+#[test]
+fn a_plan_reads_back_and_damage_is_noticed() {
+    let manifest = plan(TWO).unwrap();
+    let text = manifest.to_jsonl();
+    assert_eq!(Manifest::parse(&text, Path::new("m")).unwrap(), manifest);
+    assert_eq!(plan(TWO).unwrap().to_jsonl(), text);
+    let cut = &text[..text.len() - 40];
+    let without_a_line = text.lines().enumerate().filter(|(k, _)| *k != 3).map(|(_, l)| format!("{l}\n"));
+    let other_config = text.replacen("steps = 12000", "steps = 12001", 1);
+    assert_ne!(other_config, text);
+    for damaged in [cut.to_owned(), without_a_line.collect(), other_config, String::new()] {
+        assert!(Manifest::parse(&damaged, Path::new("m")).is_err());
+    }
+}
+
+#[test]
+fn nonsense_is_refused_before_anything_is_planned() {
+    for (text, needle) in [
+        ("tasks = []\nvariants = [\"bc\"]", "tasks"),
+        ("tasks = [\"frog-*:medium->expert\"]\nvariants = [\"bc\"]", "matches none"),
+        ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"frog\"]", "frog"),
+        ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nseeds = 1000000", "at most"),
+        ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nseed = 3", "seed"),
+        ("tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nset = [\"learner.frog=1\"]", "learner.frog"),
+    ] {
+        let message = plan(text).unwrap_err().to_string();
+        assert!(message.contains(needle), "{message}");
+    }
+}
+
+#[test]
+fn patterns_match_tasks() {
+    let count = |p: &str| tasks(&[p.into()]).unwrap().len();
+    assert_eq!((count("*"), count("hopper-*:medium->expert"), count("*-morph:medium->*")), (108, 3, 12));
+}

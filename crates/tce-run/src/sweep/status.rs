@@ -1,0 +1,172 @@
+//! How far a sweep is.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+
+use super::work::{Active, Failure, now};
+use super::{Entry, Kind, Sweep};
+use crate::error::{Error, Result};
+
+/// Without a sign of life for so long, a process counts as lost.
+const SILENCE: Duration = Duration::from_secs(60);
+
+/// The state of all work of a sweep.
+#[derive(Clone, Debug, Serialize)]
+pub struct Status {
+    /// The sweep.
+    pub name: String,
+    /// Pieces of work by kind: done, and in all.
+    pub kinds: BTreeMap<Kind, (usize, usize)>,
+    /// At work now.
+    pub running: Vec<Running>,
+    /// Indices of what failed and is neither done nor at work.
+    pub failed: Vec<(usize, String)>,
+    /// Where the logs are.
+    pub logs: PathBuf,
+    /// Indices of what is neither done, at work nor failed.
+    pub waiting: Vec<usize>,
+    /// Results that came later and differ.
+    pub faults: usize,
+    /// Seconds until everything is done, if as many stay at work as now; None as long as nothing is done of what is left, where
+    /// something failed, and where nobody is at work.
+    pub seconds_left: Option<f64>,
+    /// Scores so far: task, method, scores.
+    pub scores: Vec<(String, String, Vec<f64>)>,
+}
+
+/// Somebody at work.
+#[derive(Clone, Debug, Serialize)]
+pub struct Running {
+    /// The work.
+    pub index: usize,
+    /// What it is.
+    pub what: String,
+    /// Machine and process.
+    pub owner: String,
+    /// For so many seconds.
+    pub seconds: u64,
+}
+
+impl Sweep {
+    /// The state of all work.
+    ///
+    /// # Errors
+    /// If a record is damaged.
+    pub fn status(&self) -> Result<Status> {
+        let active = self.active();
+        let mut status = Status {
+            name: self.manifest.header.name.clone(),
+            kinds: BTreeMap::new(),
+            running: Vec::new(),
+            failed: Vec::new(),
+            logs: self.directory.join("logs"),
+            waiting: Vec::new(),
+            faults: fs::read_dir(self.directory.join("faults")).map_or(0, Iterator::count),
+            seconds_left: None,
+            scores: Vec::new(),
+        };
+        // Seconds that work of a kind and column took, and what is left of it.
+        let mut times: BTreeMap<(Kind, String), (f64, usize, usize)> = BTreeMap::new();
+        let mut scores: BTreeMap<(String, String), Vec<f64>> = BTreeMap::new();
+        for entry in self.entries() {
+            let kind = status.kinds.entry(entry.kind).or_default();
+            kind.1 += 1;
+            let time = times.entry((entry.kind, entry.column())).or_default();
+            if let Some(outcome) = self.outcome(entry)? {
+                kind.0 += 1;
+                time.0 += outcome.seconds;
+                time.1 += 1;
+                if let Some(score) = outcome.score {
+                    scores.entry((entry.task.to_string(), entry.column())).or_default().push(score);
+                }
+                continue;
+            }
+            time.2 += 1;
+            if let Some(active) = active.get(&entry.id) {
+                status.running.extend(active.iter().map(|a| Running {
+                    index: entry.index,
+                    what: entry.to_string(),
+                    owner: a.owner.clone(),
+                    seconds: now().saturating_sub(a.since),
+                }));
+            } else if let Some(failure) = self.failure(entry) {
+                status.failed.push((entry.index, failure.error));
+            } else {
+                status.waiting.push(entry.index);
+            }
+        }
+        let known = times.values().all(|&(_, done, left)| done > 0 || left == 0);
+        let work: f64 = times.values().map(|&(seconds, done, left)| seconds / done.max(1) as f64 * left as f64).sum();
+        // What failed may fail again, and what nobody does takes for ever.
+        let known = known && status.failed.is_empty() && !status.running.is_empty();
+        status.seconds_left = known.then(|| work / status.running.len() as f64);
+        status.scores = scores.into_iter().map(|((task, column), scores)| (task, column, scores)).collect();
+        Ok(status)
+    }
+
+    /// Who is at work, by the work's id.
+    fn active(&self) -> BTreeMap<String, Vec<Active>> {
+        let mut out: BTreeMap<String, Vec<Active>> = BTreeMap::new();
+        for file in fs::read_dir(self.directory.join("active")).into_iter().flatten().flatten() {
+            let modified = file.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
+            let silent = SystemTime::now().duration_since(modified).is_ok_and(|d| d > SILENCE);
+            let name = file.file_name().to_string_lossy().into_owned();
+            let active = fs::read(file.path()).ok().and_then(|b| serde_json::from_slice::<Active>(&b).ok());
+            if let (false, Some((id, _)), Some(active)) = (silent, name.split_once('.'), active) {
+                out.entry(id.to_owned()).or_default().push(active);
+            }
+        }
+        out
+    }
+
+    /// Why a piece of work failed the last time, if it did.
+    pub fn failure(&self, entry: &Entry) -> Option<Failure> {
+        let bytes = fs::read(self.file("failed", &format!("{}.json", entry.id))).ok()?;
+        serde_json::from_slice(&bytes).ok()
+    }
+}
+
+impl Status {
+    /// Whether nothing is left to do.
+    pub fn complete(&self) -> bool {
+        self.kinds.get(&Kind::Run).is_none_or(|(done, all)| done == all)
+    }
+
+    /// Whether what is left will not get done: something failed, and nobody is at work.
+    pub fn stuck(&self) -> bool {
+        !self.failed.is_empty() && self.running.is_empty()
+    }
+
+    /// Nothing, unless something failed.
+    ///
+    /// # Errors
+    /// How much failed, and what to do.
+    pub fn healthy(&self) -> Result<()> {
+        match self.failed.len() {
+            0 => Ok(()),
+            n => Err(Error::Failed(format!(
+                "{n} {} failed, with the message{} above; mend the cause and launch the sweep again (logs: {})",
+                if n == 1 { "piece of work" } else { "pieces of work" },
+                if n == 1 { "" } else { "s" },
+                self.logs.display()
+            ))),
+        }
+    }
+
+    /// What failed, by message: the first line, and the numbers of the work, in the order of the first of each.
+    pub fn failures(&self) -> Vec<(&str, Vec<usize>)> {
+        let mut groups: Vec<(&str, Vec<usize>)> = Vec::new();
+        for (index, error) in &self.failed {
+            let first = error.lines().next().unwrap_or_default();
+            match groups.iter_mut().find(|(message, _)| *message == first) {
+                Some((_, indices)) => indices.push(*index),
+                None => groups.push((first, vec![*index])),
+            }
+        }
+        groups
+    }
+}

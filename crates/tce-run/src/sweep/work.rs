@@ -1,0 +1,292 @@
+//! Doing one piece of work, once or by several copies at once.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+use tce_base::{FileError, Owner, PROGRAM, read_if_there, sha256_file, write_json, write_json_first};
+use tce_nn::Device;
+
+use super::{Entry, Kind, Sweep};
+use crate::config::GeneratedRows;
+use crate::error::{Error, Result};
+use crate::expand::{expand, label_models};
+use crate::inputs::{Inputs, source_file, target_file};
+use crate::mixture::distances_stage;
+use crate::pipeline::run;
+use crate::stage::files_of;
+
+/// Time between two signs of life.
+const BEAT: Duration = Duration::from_secs(10);
+
+/// The outcome of a piece of work.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Outcome {
+    /// The work's id.
+    pub id: String,
+    /// Normalised score, for runs; None without a simulator, or if the policy cannot act.
+    pub score: Option<f64>,
+    /// Where the result is, in the sweep's folder.
+    pub place: PathBuf,
+    /// SHA-256 of its files.
+    pub files: BTreeMap<String, String>,
+    /// Seconds it took.
+    pub seconds: f64,
+    /// Most memory of the process meanwhile, in bytes, where the system tells it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub memory: Option<u64>,
+    /// The program that did it.
+    pub program: String,
+}
+
+impl Outcome {
+    /// Whether two copies of the work came to the same.
+    pub fn agrees(&self, other: &Self) -> bool {
+        (&self.id, &self.place, &self.files, self.score.map(f64::to_bits))
+            == (&other.id, &other.place, &other.files, other.score.map(f64::to_bits))
+    }
+}
+
+/// Why a piece of work failed.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Failure {
+    /// The message.
+    pub error: String,
+    /// Seconds since 1970.
+    pub at: u64,
+}
+
+/// Who is at work.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Active {
+    /// Machine and process.
+    pub owner: String,
+    /// The batch system's job.
+    pub job: Option<String>,
+    /// Seconds since 1970.
+    pub since: u64,
+}
+
+/// Seconds since 1970.
+pub fn now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
+}
+
+/// Lets the peak of this process's memory begin anew, so that pieces of work that share a process have their own. Where the
+/// system cannot do that, a later piece has the peak of all before it.
+fn forget_peak_memory() {
+    let _ = fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Most memory that this process had at a time, in bytes.
+fn peak_memory() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let kilobytes = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.split_whitespace().next()?;
+    Some(kilobytes.parse::<u64>().ok()? * 1024)
+}
+
+/// A file in `active/` that is touched as long as this lives.
+struct Heartbeat {
+    path: PathBuf,
+    stop: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Heartbeat {
+    fn start(path: PathBuf) -> Result<Self> {
+        let job = std::env::var("SLURM_JOB_ID").ok();
+        write_json(&path, &Active { owner: Owner::this().to_string(), job, since: now() })?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let (flag, file) = (stop.clone(), path.clone());
+        let thread = std::thread::spawn(move || {
+            let mut last = Instant::now();
+            while !flag.load(Ordering::Relaxed) {
+                std::thread::park_timeout(BEAT);
+                if last.elapsed() >= BEAT {
+                    last = Instant::now();
+                    // A full disk must not end the work; the sign of life comes back with the space.
+                    let _ =
+                        fs::File::options().append(true).open(&file).and_then(|f| f.set_modified(SystemTime::now()));
+                }
+            }
+        });
+        Ok(Self { path, stop, thread: Some(thread) })
+    }
+}
+
+impl Drop for Heartbeat {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            let _ = thread.join();
+        }
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+/// A data set as an outcome: no score, its folder, its hash.
+fn data_file(file: &Path) -> Result<(Option<f64>, PathBuf, BTreeMap<String, String>)> {
+    let name = file.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+    let files = BTreeMap::from([(name, sha256_file(file)?)]);
+    Ok((None, file.parent().unwrap_or(Path::new("")).to_owned(), files))
+}
+
+impl Sweep {
+    /// The outcome of a piece of work, if it is done.
+    ///
+    /// # Errors
+    /// If the record of it is damaged.
+    pub fn outcome(&self, entry: &Entry) -> Result<Option<Outcome>> {
+        let path = self.file("done", &format!("{}.json", entry.id));
+        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
+        let outcome: Outcome = serde_json::from_slice(&bytes)
+            .map_err(|e| Error::Failed(format!("{}: {e}; remove it to do the work again", path.display())))?;
+        Ok(Some(outcome))
+    }
+
+    /// The pieces of work that are not done, in the order of the manifest.
+    ///
+    /// # Errors
+    /// If the record of one is damaged.
+    pub fn missing(&self) -> Result<Vec<&Entry>> {
+        let mut missing = Vec::new();
+        for entry in self.entries() {
+            if self.outcome(entry)?.is_none() {
+                missing.push(entry);
+            }
+        }
+        Ok(missing)
+    }
+
+    /// Does a piece of work, unless it is done.
+    ///
+    /// # Errors
+    /// What went wrong, which is also kept in `failed/`; if a copy of the work came to another result before.
+    pub fn work(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
+        if let Some(outcome) = self.outcome(entry)? {
+            return Ok(outcome);
+        }
+        if let Some(change) = self.changed_input(entry) {
+            return Err(Error::Failed(change));
+        }
+        let beat = Heartbeat::start(self.file("active", &format!("{}.{}.json", entry.id, Owner::this())))?;
+        let outcome = self.compute(entry, device).and_then(|outcome| self.settle(outcome));
+        drop(beat);
+        let failed = self.file("failed", &format!("{}.json", entry.id));
+        match &outcome {
+            Ok(_) => drop(fs::remove_file(failed)),
+            Err(e) if e.exit_code() == 130 => {}
+            Err(e) => write_json(&failed, &Failure { error: e.to_string(), at: now() })?,
+        }
+        outcome
+    }
+
+    fn compute(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
+        // Before hours of training, not after them.
+        tce_sim::open_library()?;
+        let started = Instant::now();
+        forget_peak_memory();
+        let config = self.manifest.config(entry)?;
+        let args = self.data(entry);
+        let root = &args.out;
+        let seeds = &[entry.seed];
+        let (score, place, files) = match entry.kind {
+            Kind::Source => data_file(&source_file(entry.task, &args, config.source.rows)?)?,
+            Kind::Target => data_file(&target_file(entry.task, &args)?)?,
+            Kind::Expand => {
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
+                let stage = match config.mixture.generated {
+                    GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, device)?.1,
+                    _ => expand(&inputs, &config, seeds, root, device)?.stage,
+                };
+                (None, stage.directory().to_owned(), files_of(stage.directory())?)
+            }
+            Kind::Distances => {
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
+                let kind = config.distances().expect("planned for a configuration that has some");
+                let place = distances_stage(&inputs, kind, root)?.1;
+                (None, place.clone(), files_of(&place)?)
+            }
+            Kind::Run => {
+                let inputs = Inputs::of_config(entry.task, &args, &config)?;
+                let name = entry.column().replace(' ', "-");
+                let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), device)?;
+                (summary.scores.first().copied().flatten(), summary.directory.clone(), files_of(&summary.directory)?)
+            }
+        };
+        Ok(Outcome {
+            id: entry.id.clone(),
+            score,
+            place: place.strip_prefix(&self.directory).unwrap_or(&place).to_owned(),
+            files,
+            seconds: started.elapsed().as_secs_f64(),
+            memory: peak_memory(),
+            program: PROGRAM.into(),
+        })
+    }
+
+    /// Makes `outcome` the work's outcome, unless a copy of the work was first.
+    ///
+    /// # Errors
+    /// If that copy came to another result: both are kept.
+    pub fn settle(&self, outcome: Outcome) -> Result<Outcome> {
+        let path = self.file("done", &format!("{}.json", outcome.id));
+        if write_json_first(&path, &outcome)? {
+            return Ok(outcome);
+        }
+        let bytes = fs::read(&path).map_err(|e| FileError::new(&path, "read", e))?;
+        match serde_json::from_slice::<Outcome>(&bytes) {
+            Ok(first) if first.agrees(&outcome) => Ok(first),
+            first => {
+                let fault = self.file("faults", &format!("{}.{}.json", outcome.id, Owner::this()));
+                write_json(&fault, &serde_json::json!({ "first": first.ok(), "later": outcome }))?;
+                Err(Error::Failed(format!(
+                    "two copies of the work {} came to different results; the first stays, and {} holds both. This is a \
+                     fault of determinism: were they done by different builds or processors?",
+                    outcome.id,
+                    fault.display()
+                )))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sweep::Manifest;
+
+    #[test]
+    fn the_first_outcome_stays_and_another_one_is_a_fault() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("s.toml");
+        fs::write(&path, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nfloors = false\n").unwrap();
+        let sweep = Sweep::create(&dir.path().join("s"), Manifest::plan(&path).unwrap()).unwrap();
+        let entry = sweep.entries().last().unwrap();
+        let outcome = |score: f64, seconds: f64| Outcome {
+            id: entry.id.clone(),
+            score: Some(score),
+            place: "runs/x".into(),
+            files: BTreeMap::new(),
+            seconds,
+            memory: None,
+            program: "tce".into(),
+        };
+        assert_eq!(sweep.outcome(entry).unwrap(), None);
+        sweep.settle(outcome(1.0, 5.0)).unwrap();
+        // The same in another time is the same.
+        assert_eq!(sweep.settle(outcome(1.0, 7.0)).unwrap().seconds, 5.0);
+        let message = sweep.settle(outcome(2.0, 5.0)).unwrap_err().to_string();
+        assert!(message.contains("fault of determinism"), "{message}");
+        assert_eq!(sweep.outcome(entry).unwrap().unwrap().score, Some(1.0));
+        assert_eq!(sweep.gather().unwrap().conflicts.len(), 1);
+        assert_eq!(sweep.status().unwrap().faults, 1);
+        let left = fs::read_dir(dir.path().join("s/done")).unwrap().count();
+        assert_eq!(left, 1, "nothing half-written stays");
+    }
+}

@@ -1,0 +1,290 @@
+//! Which policy is recommended, told from the two data sets alone ([`crate::judge`]), and how sure that is.
+//!
+//! Every policy is tried from the same target states in the same learned models, so that two policies are compared episode by
+//! episode. The rule, measured in bench/expansion.md:
+//!
+//! 1. The standard is the floor whose imagined return is highest.
+//! 2. A method is recommended instead if its imagined episodes return more than the standard's, by more than [`SURE`] standard errors of
+//!    the paired differences and by more than [`LEAST`] of the standard's return. Of several, the one with the highest return.
+//! 3. Of several seeds of the recommended method, the one with the highest imagined return is taken.
+//!
+//! Learned dynamics err, and a policy that leaves the data errs with them: where the difference is within what the models cannot
+//! tell, the floor stands.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use tce_base::{Progress, mean_std};
+use tce_learn::{FittedQConfig, FittedValue, Policy};
+use tce_nn::Device;
+
+use crate::error::{Error, Result};
+use crate::judge::{Judge, Judged};
+
+/// Standard errors of a difference that is more than chance.
+pub const SURE: f64 = 2.0;
+/// Share of the standard's return that a difference has to exceed.
+pub const LEAST: f64 = 0.02;
+/// The recommended policy's file.
+pub const FILE: &str = "policy.safetensors";
+
+/// The policies of one method, one per seed.
+#[derive(Clone, Debug)]
+pub struct Candidate {
+    /// The method's name in tables.
+    pub name: String,
+    /// Whether it is a floor: no more than the target rows, no generated ones.
+    pub floor: bool,
+    /// The policies' files.
+    pub files: Vec<PathBuf>,
+}
+
+/// What was found of a candidate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Tried {
+    /// The method's name.
+    pub name: String,
+    /// Whether it is a floor.
+    pub floor: bool,
+    /// Imagined return, mean over the seeds.
+    pub imagined_return: f64,
+    /// Standard error of it, over the imagined episodes of the policies' mean.
+    #[serde(default)]
+    pub standard_error: f64,
+    /// Share of the steps of whole episodes that were reached, mean over the seeds.
+    pub survival: f64,
+    /// RMSE of the actions at target states against the behaviour's, mean over the seeds; the box is 2 wide.
+    #[serde(default)]
+    pub action_error: f64,
+    /// Discounted return by fitted Q evaluation, mean over the seeds, and the greatest of their standard errors; none where it was not
+    /// asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fitted_q: Option<[f64; 2]>,
+    /// Imagined return less that of the standard, and its standard error.
+    pub over_standard: [f64; 2],
+}
+
+/// The recommendation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Verdict {
+    /// The method.
+    pub method: String,
+    /// Its policy with the highest imagined return.
+    pub policy: PathBuf,
+    /// Whether the difference that decided is more than [`SURE`] standard errors.
+    pub sure: bool,
+    /// In a sentence.
+    pub reason: String,
+    /// All candidates, as they were given.
+    pub tried: Vec<Tried>,
+    /// The discounted return of the target's episodes as they were logged; none where no policy has a fitted one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub behaviour_value: Option<f64>,
+}
+
+/// Mean over the seeds of every imagined episode's return.
+fn episodes(judged: &[Judged]) -> Vec<f64> {
+    let count = judged.len().max(1) as f64;
+    let n = judged.first().map_or(0, |j| j.returns.len());
+    (0..n).map(|i| judged.iter().map(|j| j.returns[i]).sum::<f64>() / count).collect()
+}
+
+/// Mean and its standard error.
+fn mean_and_error(values: &[f64]) -> [f64; 2] {
+    let (mean, std) = mean_std(values);
+    [mean, std / (values.len().max(1) as f64).sqrt()]
+}
+
+/// Mean and standard error of the paired differences.
+fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
+    mean_and_error(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>())
+}
+
+/// The verdict where there is no choice: one candidate with one policy.
+pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
+    let [Candidate { name, files, .. }] = candidates else { return None };
+    let [policy] = &files[..] else { return None };
+    let reason = format!("{name} is the only policy there is.");
+    Some(Verdict {
+        method: name.clone(),
+        policy: policy.clone(),
+        sure: true,
+        reason,
+        tried: Vec::new(),
+        behaviour_value: None,
+    })
+}
+
+/// Tries all candidates in learned dynamics and recommends one. With `fitted_q` their policies are evaluated by fitted Q, too: those
+/// figures are shown and decide nothing, because they do not rank policies (bench/expansion.md).
+///
+/// # Errors
+/// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
+pub fn recommend(
+    judge: impl FnOnce() -> Result<Judge>,
+    candidates: &[Candidate],
+    fitted_q: Option<(&FittedQConfig, &Device)>,
+) -> Result<Verdict> {
+    let judge = judge()?;
+    tce_base::begin_step("verdict");
+    let progress = Progress::new("try policies", candidates.iter().map(|c| c.files.len() as u64).sum(), "policies");
+    let try_one = |file: &PathBuf| judge.judge(&Policy::load(file)?).inspect(|_| progress.inc(1));
+    let try_all = |c: &Candidate| c.files.iter().map(try_one).collect::<Result<Vec<_>>>();
+    let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
+    progress.finish();
+    let mut verdict = decide(candidates, &judged)?;
+    if let Some((config, device)) = fitted_q {
+        let policies = candidates.iter().flat_map(|c| &c.files).map(|f| Ok(Policy::load(f)?));
+        let values = judge.values(&policies.collect::<Result<Vec<_>>>()?, config, device)?;
+        let mut values = values.iter();
+        for (tried, candidate) in verdict.tried.iter_mut().zip(candidates) {
+            let own: Vec<&FittedValue> = values.by_ref().take(candidate.files.len()).collect();
+            let mean = mean_std(&own.iter().map(|v| v.mean()).collect::<Vec<_>>()).0;
+            tried.fitted_q = Some([mean, own.iter().map(|v| v.standard_error()).fold(0.0, f64::max)]);
+        }
+        verdict.behaviour_value = Some(judge.behaviour_value(config));
+    }
+    Ok(verdict)
+}
+
+fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
+    let returns: Vec<Vec<f64>> = judged.iter().map(|j| episodes(j)).collect();
+    let mean = |k: usize| mean_std(&returns[k]).0;
+    let best = |of: &dyn Fn(usize) -> bool| {
+        (0..candidates.len()).filter(|&k| of(k) && !judged[k].is_empty()).max_by(|&a, &b| mean(a).total_cmp(&mean(b)))
+    };
+    let standard = best(&|k| candidates[k].floor).or_else(|| best(&|_| true));
+    let standard = standard.ok_or_else(|| Error::Failed("there is no policy to recommend".into()))?;
+    let over: Vec<[f64; 2]> = returns.iter().map(|r| difference(r, &returns[standard])).collect();
+    let beats = |k: usize| over[k][0] > SURE * over[k][1] && over[k][0] > LEAST * mean(standard).abs();
+    let chosen = best(&|k| !candidates[k].floor && beats(k)).unwrap_or(standard);
+    let rival = best(&|k| k != chosen);
+    let gap = rival.map(|k| difference(&returns[chosen], &returns[k]));
+    let name = |k: usize| &candidates[k].name;
+    let reason = match (rival, gap) {
+        (Some(k), Some([by, error])) if chosen != standard => {
+            format!(
+                "{} is recommended: tried in learned dynamics it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
+                name(chosen),
+                mean(chosen),
+                name(standard),
+                mean(standard),
+            ) + if k == standard { "" } else { " The next best is no floor." }
+        }
+        (Some(k), Some([by, error])) => format!(
+            "{} is recommended: tried in learned dynamics no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
+            name(chosen),
+            if by >= 0.0 { "it is ahead by" } else { "it is behind by" },
+            name(k),
+        ),
+        _ => format!("{} is the only method there is.", name(chosen)),
+    };
+    let seed = (0..judged[chosen].len())
+        .max_by(|&a, &b| judged[chosen][a].imagined_return.total_cmp(&judged[chosen][b].imagined_return));
+    let of_seeds =
+        |k: usize, figure: &dyn Fn(&Judged) -> f64| mean_std(&judged[k].iter().map(figure).collect::<Vec<_>>()).0;
+    let tried = |k: usize| Tried {
+        name: candidates[k].name.clone(),
+        floor: candidates[k].floor,
+        imagined_return: mean(k),
+        standard_error: mean_and_error(&returns[k])[1],
+        survival: of_seeds(k, &|j| j.survival),
+        action_error: of_seeds(k, &|j| j.action_error),
+        fitted_q: None,
+        over_standard: over[k],
+    };
+    Ok(Verdict {
+        method: name(chosen).clone(),
+        policy: candidates[chosen].files[seed.unwrap_or(0)].clone(),
+        sure: gap.is_none_or(|[by, error]| by > SURE * error),
+        reason,
+        tried: (0..candidates.len()).map(tried).collect(),
+        behaviour_value: None,
+    })
+}
+
+/// A verdict and the file that its policy was put into.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Kept {
+    /// The file.
+    pub file: PathBuf,
+    /// The verdict.
+    #[serde(flatten)]
+    pub verdict: Verdict,
+}
+
+impl Kept {
+    /// What a person reads.
+    pub fn sentences(&self) -> String {
+        let doubt = if self.verdict.sure { "" } else { " The data do not tell for sure." };
+        format!("{}{doubt}\nrecommended policy: {}", self.verdict.reason, self.file.display())
+    }
+}
+
+/// Puts the recommended policy into `directory`, whole or not at all, and the verdict beside it.
+///
+/// # Errors
+/// If a file cannot be read or written.
+pub fn keep(verdict: Verdict, directory: &Path) -> Result<Kept> {
+    let place = directory.join(FILE);
+    Policy::load(&verdict.policy)?.save(&place)?;
+    // Relative, so that the folder can be moved and two copies of a run have the same bytes.
+    let policy = verdict.policy.strip_prefix(directory).unwrap_or(&verdict.policy).to_owned();
+    tce_base::write_json(&directory.join("verdict.json"), &Verdict { policy, ..verdict.clone() })?;
+    Ok(Kept { file: place, verdict })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn judged(returns: &[f64]) -> Judged {
+        let (mean, std) = mean_std(returns);
+        Judged {
+            imagined_return: mean,
+            standard_error: std,
+            survival: 1.0,
+            distance: 1.0,
+            action_error: 0.1,
+            returns: returns.to_vec(),
+        }
+    }
+
+    fn candidates(names: &[(&str, bool)]) -> Vec<Candidate> {
+        let of = |(name, floor): &(&str, bool)| Candidate {
+            name: (*name).into(),
+            floor: *floor,
+            files: vec![format!("{name}-0").into(), format!("{name}-1").into()],
+        };
+        names.iter().map(of).collect()
+    }
+
+    fn choose(method: [&[f64]; 2]) -> Verdict {
+        let floor = vec![judged(&[100.0, 200.0, 300.0, 400.0]), judged(&[100.0, 200.0, 300.0, 402.0])];
+        let method = method.map(judged).to_vec();
+        decide(&candidates(&[("floor", true), ("method", false)]), &[floor, method]).unwrap()
+    }
+
+    #[test]
+    fn a_method_has_to_beat_the_floor_episode_by_episode() {
+        // Fifty more in every episode: certain, however much the episodes differ.
+        let ahead = choose([&[150.0, 250.0, 350.0, 450.0], &[150.0, 250.0, 350.0, 452.0]]);
+        assert_eq!((ahead.method.as_str(), ahead.policy.to_str(), ahead.sure), ("method", Some("method-1"), true));
+        assert_eq!(ahead.tried[1].over_standard[0], 50.0);
+        // As much on average, from one episode: chance.
+        let lucky = choose([&[100.0, 200.0, 300.0, 600.0], &[100.0, 200.0, 300.0, 600.0]]);
+        assert_eq!((lucky.method.as_str(), lucky.sure), ("floor", false));
+        // Always more, but by nothing that matters.
+        let slightly = choose([&[101.0, 201.0, 301.0, 402.0], &[101.0, 201.0, 301.0, 402.0]]);
+        assert_eq!(slightly.method, "floor");
+        assert_eq!(slightly.policy.to_str(), Some("floor-1"), "the better seed");
+    }
+
+    #[test]
+    fn without_floors_the_best_is_taken_and_without_policies_nothing() {
+        let two = candidates(&[("a", false), ("b", false)]);
+        let verdict = decide(&two, &[vec![judged(&[1.0, 2.0])], vec![judged(&[3.0, 4.0])]]).unwrap();
+        assert_eq!(verdict.method, "b");
+        assert!(decide(&two, &[vec![], vec![]]).is_err());
+    }
+}

@@ -1,0 +1,133 @@
+//! Films as files: pictures from `tce-sim` are drawn on all cores and encoded in order.
+
+mod error;
+mod gif;
+mod mp4;
+
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use tce_base::{AtomicFile, FileError, Progress, interrupted};
+use tce_sim::SimError;
+use tce_sim::film::{Film, Picture};
+
+pub use error::{Error, Result};
+
+/// Pictures that are drawn at once. The film does not depend on it.
+const BATCH: usize = 16;
+
+/// The kinds of file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Format {
+    Gif,
+    Mp4,
+}
+
+/// A film's file, named on the command line: the ending decides what is written.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VideoFile {
+    path: PathBuf,
+    format: Format,
+}
+
+/// Reads `film.gif` and `film.mp4`, and refuses everything else.
+pub fn parse_video(text: &str) -> Result<VideoFile, String> {
+    let path = PathBuf::from(text);
+    let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let format = match ending.as_deref() {
+        Some("gif") => Format::Gif,
+        Some("mp4") => Format::Mp4,
+        Some(other) => return Err(format!("found the ending `.{other}`, expected .gif or .mp4")),
+        None => return Err("found no ending, expected a name that ends in .gif or .mp4".to_owned()),
+    };
+    Ok(VideoFile { path, format })
+}
+
+/// Reads the size of a panel, `480x360`. H.264 takes even numbers only; labels need 320 columns.
+pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
+    let expected = "expected WIDTHxHEIGHT, even numbers from 320x240 to 1920x1080, as in 480x360";
+    let numbers = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+    let [width, height]: [usize; 2] = numbers.ok_or(expected)?;
+    let fits = (320..=1920).contains(&width) && (240..=1080).contains(&height);
+    if fits && width % 2 == 0 && height % 2 == 0 { Ok([width, height]) } else { Err(expected.to_owned()) }
+}
+
+/// A film's file that can be written, as far as one can know before the film is there.
+pub struct Studio {
+    file: AtomicFile,
+    path: PathBuf,
+    encoder: Encoder,
+}
+
+enum Encoder {
+    Gif,
+    Mp4(mp4::Ffmpeg),
+}
+
+impl VideoFile {
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Makes sure of everything that the file needs, so that what is missing is said before any work.
+    pub fn prepare(self) -> Result<Studio> {
+        let encoder = match self.format {
+            Format::Gif => Encoder::Gif,
+            Format::Mp4 => Encoder::Mp4(mp4::Ffmpeg::find(&self.path)?),
+        };
+        Ok(Studio { file: AtomicFile::create(&self.path)?, path: self.path, encoder })
+    }
+}
+
+impl Studio {
+    /// Draws and writes the film; how many bytes it has.
+    pub fn write(mut self, film: &Film) -> Result<u64> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        let progress = Progress::new(format!("draw {name}"), film.frames() as u64, "pictures");
+        match &self.encoder {
+            Encoder::Gif => gif::write(film, &mut self.file, &self.path, &progress)?,
+            Encoder::Mp4(ffmpeg) => ffmpeg.write(film, self.file.path(), &self.path, &progress)?,
+        }
+        self.file.commit()?;
+        progress.finish();
+        let bytes = std::fs::metadata(&self.path).map_err(|e| FileError::new(&self.path, "look at", e))?.len();
+        Ok(bytes)
+    }
+}
+
+/// Draws a film batch by batch and hands the pictures over, in order.
+fn draw(film: &Film, progress: &Progress, mut take: impl FnMut(Vec<Picture>) -> Result<()>) -> Result<()> {
+    for start in (0..film.frames()).step_by(BATCH) {
+        if interrupted() {
+            return Err(SimError::Interrupted.into());
+        }
+        let frames = start..(start + BATCH).min(film.frames());
+        let count = frames.len() as u64;
+        take(frames.into_par_iter().map(|frame| film.draw(frame)).collect())?;
+        progress.inc(count);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ending_decides() {
+        for (text, format) in [("a.gif", Format::Gif), ("b/c.MP4", Format::Mp4)] {
+            assert_eq!(parse_video(text).unwrap(), VideoFile { path: text.into(), format });
+        }
+        assert!(parse_video("film.webm").unwrap_err().contains("`.webm`"));
+        assert!(parse_video("gif").unwrap_err().contains("no ending"));
+    }
+
+    #[test]
+    fn sizes_are_even_and_of_use() {
+        assert_eq!(parse_size("480x360"), Ok([480, 360]));
+        for text in ["480", "481x360", "480x-2", "240x180", "4000x1000", "480 x 360"] {
+            assert!(parse_size(text).unwrap_err().contains("480x360"), "{text}");
+        }
+    }
+}

@@ -1,0 +1,204 @@
+//! Policies in the simulator: collecting data sets with them and scoring them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use tce_base::scratch::Scratch;
+use tce_base::{PROGRAM, Progress, Rng, Streams, move_into_place, sha256_file, sha256_hex};
+use tce_data::{Agent, ReferenceScores, ScoreTable, Shift, Transitions, reference_scores, save_d4rl};
+use tce_learn::{Memory, Policy};
+use tce_sim::{Actor, CollectOptions, EpisodeResult, Recording};
+
+use crate::error::{Error, Result};
+use crate::exhibits::Exhibit;
+use crate::recipes::Recipe;
+
+/// A policy as the simulator wants it.
+pub struct PolicyActor {
+    policy: Policy,
+    mean: bool,
+}
+
+impl PolicyActor {
+    /// Acts by the mean action, or by sampled ones.
+    pub fn new(policy: Policy, mean: bool) -> Self {
+        Self { policy, mean }
+    }
+}
+
+impl Actor for PolicyActor {
+    type Memory = Memory;
+
+    fn start(&self) -> Memory {
+        self.policy.start()
+    }
+
+    fn act(&self, observations: &[f32], memories: &mut [Memory], rngs: &mut [Rng], actions: &mut [f32]) {
+        self.policy.act_with(observations, memories, (!self.mean).then_some(rngs), actions);
+    }
+
+    fn reward(&self, memory: &mut Memory, reward: f64) {
+        self.policy.reward(memory, reward);
+    }
+}
+
+/// Loads a policy, from a file or as `zoo:NAME`, and checks that it is one for `agent`.
+pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
+    let policy = match Exhibit::at(path)? {
+        Some(exhibit) => exhibit.policy()?,
+        None => Policy::load(path)?,
+    };
+    let (found, expected) = (policy.dims(), agent.dims());
+    if found != expected {
+        return Err(Error::Failed(format!(
+            "{}: a policy of {} observations and {} actions; {agent} has {} and {}. Choose a policy of this agent",
+            path.display(),
+            found.0,
+            found.1,
+            expected.0,
+            expected.1
+        )));
+    }
+    Ok(policy)
+}
+
+impl Recipe {
+    /// Rolls the actors out.
+    pub fn collect(&self) -> Result<Transitions> {
+        let (obs_dim, act_dim) = self.agent.dims();
+        let total: f64 = self.parts.iter().map(|p| p.weight).sum();
+        if self.parts.is_empty() || self.parts.iter().any(|p| !(p.weight > 0.0 && p.weight.is_finite())) {
+            return Err(Error::Usage("a mixture needs at least one actor, and positive weights".into()));
+        }
+        let policies: Vec<_> = self.parts.iter().map(|p| load_policy(&p.actor, self.agent)).collect::<Result<_>>()?;
+        let label = format!("collect {}-{}", self.agent, self.shift);
+        let progress = Progress::new(label, self.rows as u64, "rows");
+        let mut out = Transitions::with_capacity(obs_dim, act_dim, self.rows);
+        let mut before = 0.0;
+        for (k, (part, policy)) in self.parts.iter().zip(policies).enumerate() {
+            // Rounding the running sum keeps the total exact.
+            let from = (self.rows as f64 * before / total).round() as usize;
+            before += part.weight;
+            let to = (self.rows as f64 * before / total).round() as usize;
+            let streams = Streams::new(self.seed.wrapping_add(k as u64 * 0x9e37_79b9_7f4a_7c15));
+            let options = CollectOptions { rows: to - from, lanes: self.lanes, streams, progress: Some(&progress) };
+            let actor = PolicyActor::new(policy, self.mean);
+            out.extend(&tce_sim::collect(self.agent, self.shift, &actor, &options)?);
+        }
+        progress.finish();
+        Ok(out)
+    }
+
+    /// What goes into the file beside the rows.
+    pub fn attributes(&self) -> Result<BTreeMap<String, String>> {
+        let mut attributes = BTreeMap::new();
+        attributes.insert("recipe".to_owned(), serde_json::to_string(self).expect("plain data"));
+        attributes.insert("agent".to_owned(), self.agent.to_string());
+        attributes.insert("shift".to_owned(), self.shift.to_string());
+        attributes.insert("program".to_owned(), PROGRAM.to_owned());
+        for (k, part) in self.parts.iter().enumerate() {
+            let hash = match Exhibit::at(&part.actor)? {
+                Some(exhibit) => exhibit.sha256(),
+                None => sha256_file(&part.actor)?,
+            };
+            attributes.insert(format!("actor_{k}_sha256"), hash);
+        }
+        Ok(attributes)
+    }
+
+    /// The file of this recipe in `directory`, collected now unless it is there.
+    pub fn cached(&self, directory: &Path, name: &str) -> Result<PathBuf> {
+        let attributes = self.attributes()?;
+        let key = sha256_hex(serde_json::to_string(&attributes).expect("strings").as_bytes());
+        let path = directory.join(format!("{name}-{}.hdf5", &key[..12]));
+        Scratch::tidy(directory);
+        if !path.exists() {
+            let scratch = Scratch::new(directory)?;
+            let own = scratch.file("rows.hdf5");
+            save_d4rl(&own, &self.collect()?, &attributes, &[])?;
+            move_into_place(&own, &path)?;
+        }
+        Ok(path)
+    }
+}
+
+/// Returns of some episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// Undiscounted return of every episode.
+    pub returns: Vec<f64>,
+    /// Steps of every episode.
+    pub lengths: Vec<usize>,
+    /// 100 (J - J_r) / (J_e - J_r) of the mean return, where references are known.
+    pub score: Option<f64>,
+    /// Why there are no episodes, if there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failed: Option<String>,
+}
+
+impl Evaluation {
+    fn of(results: &[EpisodeResult], reference: Option<ReferenceScores>) -> Self {
+        let returns: Vec<f64> = results.iter().map(|r| r.episode_return).collect();
+        let mean_return = returns.iter().sum::<f64>() / returns.len() as f64;
+        let score = reference.map(|r| r.normalised_score(mean_return));
+        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score, failed: None }
+    }
+
+    /// That of a policy that cannot act, and why.
+    pub fn failed(why: String) -> Self {
+        Self { returns: Vec::new(), lengths: Vec::new(), score: None, failed: Some(why) }
+    }
+
+    /// Mean of the episodes' lengths.
+    pub fn mean_length(&self) -> f64 {
+        self.lengths.iter().sum::<usize>() as f64 / self.lengths.len() as f64
+    }
+}
+
+/// Where policies are judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Arena {
+    /// The robot.
+    pub agent: Agent,
+    /// The domain.
+    pub shift: Shift,
+    /// Returns that stand for 0 and 100.
+    pub reference: Option<ReferenceScores>,
+}
+
+impl Arena {
+    /// With the references of `table`, where it has any.
+    pub fn new(agent: Agent, shift: Shift, table: ScoreTable) -> Self {
+        Self { agent, shift, reference: reference_scores(agent, shift, table) }
+    }
+}
+
+/// Rolls `policy` out for `episodes` episodes, by its `mean` action or by sampled ones, unless `stop` says so:
+/// [`tce_base::interrupted`] where the user may end it.
+pub fn evaluate(
+    policy: &Policy,
+    arena: Arena,
+    episodes: usize,
+    streams: Streams,
+    mean: bool,
+    stop: impl Fn() -> bool,
+) -> Result<Evaluation> {
+    let actor = PolicyActor::new(policy.clone(), mean);
+    let results = tce_sim::evaluate(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
+    Ok(Evaluation::of(&results, arena.reference))
+}
+
+/// [`evaluate`] with a recording of the first episode.
+pub fn evaluate_recorded(
+    policy: &Policy,
+    arena: Arena,
+    episodes: usize,
+    streams: Streams,
+    mean: bool,
+    stop: impl Fn() -> bool,
+) -> Result<(Evaluation, Recording)> {
+    let actor = PolicyActor::new(policy.clone(), mean);
+    let (results, recording) = tce_sim::evaluate_recorded(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
+    Ok((Evaluation::of(&results, arena.reference), recording))
+}

@@ -1,0 +1,94 @@
+//! How data sets are collected, and by whom.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use tce_data::{Agent, Quality, Shift};
+
+/// One actor's part in a data set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Part {
+    /// The policy's file, or `zoo:NAME`.
+    pub actor: PathBuf,
+    /// Its share of the rows, relative to the other parts'.
+    pub weight: f64,
+}
+
+/// How a data set is collected; equal recipes give equal bytes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Recipe {
+    /// The robot.
+    pub agent: Agent,
+    /// The domain.
+    pub shift: Shift,
+    /// One after the other, as D4RL's medium-expert is medium, then expert.
+    pub parts: Vec<Part>,
+    /// Rows in all.
+    pub rows: usize,
+    /// Mean instead of sampled actions.
+    pub mean: bool,
+    /// Environments in lockstep.
+    pub lanes: usize,
+    /// The seed of everything random in it.
+    pub seed: u64,
+}
+
+/// Who acts in the data sets of one robot in one domain; a part for which nobody is there is empty.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Cast {
+    /// D4RL's medium behaviour.
+    pub medium: Vec<Part>,
+    /// D4RL's expert behaviour.
+    pub expert: Vec<Part>,
+    /// The policies of a training until the medium level.
+    pub replay: Vec<Part>,
+}
+
+/// Rows of a target set (OTDF).
+pub const TARGET_ROWS: usize = 5000;
+
+impl Cast {
+    /// D4RL's source data of this quality, `rows` for medium or expert: twice as many for both one after the other, and for a replay
+    /// buffer the share that D4RL's have. None if an actor is missing.
+    pub fn source(self, agent: Agent, shift: Shift, quality: Quality, rows: usize, seed: u64) -> Option<Recipe> {
+        let rows = match quality {
+            Quality::Medium | Quality::Expert => rows,
+            Quality::MediumExpert => 2 * rows,
+            Quality::MediumReplay => {
+                // D4RL's buffers hold 202k, 402k, 302k and 302k rows beside 1M of medium.
+                let share = match agent {
+                    Agent::HalfCheetah => 0.202,
+                    Agent::Hopper => 0.402,
+                    Agent::Walker2d | Agent::Ant => 0.302,
+                };
+                (rows as f64 * share) as usize
+            }
+        };
+        let parts = self.parts(quality, [1.0, 1.0])?;
+        Some(Recipe { agent, shift, parts, rows, mean: false, lanes: 32, seed })
+    }
+
+    /// A target set as OTDF's are: [`TARGET_ROWS`] rows of whole episodes but the last; medium-expert is two parts of medium to
+    /// three of expert, and its successors are the real ones. None if an actor is missing.
+    pub fn target(self, agent: Agent, shift: Shift, quality: Quality, seed: u64) -> Option<Recipe> {
+        let parts = self.parts(quality, [0.4, 0.6])?;
+        // Another seed than the source's, or both sets would begin with the same noise.
+        let seed = seed ^ u64::from_le_bytes(*b"target\0\0");
+        // One lane: many would each cut an episode.
+        Some(Recipe { agent, shift, parts, rows: TARGET_ROWS, mean: false, lanes: 1, seed })
+    }
+
+    fn parts(self, quality: Quality, [medium, expert]: [f64; 2]) -> Option<Vec<Part>> {
+        let scaled = |parts: Vec<Part>, share: f64| {
+            let total: f64 = parts.iter().map(|p| p.weight).sum();
+            parts.into_iter().map(move |p| Part { weight: p.weight * share / total, ..p }).collect::<Vec<_>>()
+        };
+        let needed = match quality {
+            Quality::Medium => vec![scaled(self.medium, 1.0)],
+            Quality::Expert => vec![scaled(self.expert, 1.0)],
+            Quality::MediumReplay => vec![scaled(self.replay, 1.0)],
+            Quality::MediumExpert => vec![scaled(self.medium, medium), scaled(self.expert, expert)],
+        };
+        needed.iter().all(|p| !p.is_empty()).then(|| needed.concat())
+    }
+}
