@@ -12,7 +12,7 @@
 //! | symbol | field | default | source |
 //! |---|---|---|---|
 //! | γ | `discount` | .99 | as the learners |
-//! | - | `steps`, `batch`, `lr` | 5 000, 256, 3e-4 | - |
+//! | - | `steps`, `batch`, `lr` | 3 000, 256, 3e-4 | - |
 //! | Q' ← (1 - ρ) Q' + ρ Q | `polyak` | .005 | TD3 |
 //! | - | `hidden` | 256, 256 ReLU | as the critics |
 //! | - | `replicates` | 3 | - |
@@ -71,7 +71,7 @@ impl Default for FittedQConfig {
     fn default() -> Self {
         Self {
             discount: 0.99,
-            steps: 5_000,
+            steps: 3_000,
             batch: 256,
             lr: 3e-4,
             polyak: 0.005,
