@@ -8,6 +8,7 @@
 //! | figure | meaning |
 //! |---|---|
 //! | imagined return | mean return of the imagined episodes, per step of a whole episode |
+//! | supported return | the same until the episode first leaves the target's states: is further from the nearest one than [`FAR`] times the median distance between target rows of different episodes |
 //! | survival | share of the steps of whole episodes that were reached |
 //! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
 //! | action error | RMSE of the policy's actions at target states against the behaviour's |
@@ -35,6 +36,8 @@ use crate::stage::Stage;
 const STARTS: usize = 32;
 /// Share of the target rows that the ensemble does not see.
 const HELD_OUT: f64 = 0.05;
+/// A state this many times further from the target's states than these are from those of other episodes is not one that the models know.
+pub const FAR: f64 = 5.0;
 /// A state further outside of everything seen than this share of a column's range ends an imagined episode.
 const MARGIN: f32 = 0.25;
 
@@ -64,6 +67,8 @@ pub struct Judged {
     pub imagined_return: f64,
     /// Standard error of it, over the networks and the starts.
     pub standard_error: f64,
+    /// Mean return until the episodes leave the target's states.
+    pub supported_return: f64,
     /// Mean share of the steps of a whole episode.
     pub survival: f64,
     /// Median distance to the nearest target state.
@@ -72,6 +77,8 @@ pub struct Judged {
     pub action_error: f64,
     /// The return of every imagined episode, networks one after the other.
     pub returns: Vec<f64>,
+    /// The same until it leaves the target's states.
+    pub supported_returns: Vec<f64>,
 }
 
 impl Judge {
@@ -155,6 +162,8 @@ impl Judge {
         let mut returns = vec![vec![0.0; lanes]; networks];
         let mut steps = vec![vec![0usize; lanes]; networks];
         let mut visited = Transitions::new(width, 1);
+        // The episode of every visited state, and its return up to there.
+        let mut passed: Vec<(usize, f64)> = Vec::new();
         for step in 0..self.limit {
             if alive.iter().flatten().all(|a| !a) {
                 break;
@@ -185,6 +194,7 @@ impl Judge {
                     alive[k][lane] = inside && !prediction.terminals[lane];
                     if inside && step % 10 == 0 {
                         visited.push(next, &[0.0], 0.0, next, false, true);
+                        passed.push((k * lanes + lane, returns[k][lane]));
                     }
                 }
                 // Lanes that are over stay where they are: what the networks say of them is not looked at.
@@ -198,15 +208,26 @@ impl Judge {
         }
         let returns = returns.concat();
         let n = returns.len() as f64;
+        let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t)? };
+        let far = std::env::var("TCE_FAR").ok().and_then(|f| f.parse().ok()).unwrap_or(FAR) * self.spacing;
+        let mut supported: Vec<Option<f64>> = vec![None; returns.len()];
+        for (&distance, &(episode, so_far)) in distances.iter().zip(&passed) {
+            if f64::from(distance) > far {
+                supported[episode].get_or_insert(so_far);
+            }
+        }
+        let supported: Vec<f64> = supported.iter().zip(&returns).map(|(s, whole)| s.unwrap_or(*whole)).collect();
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
         Ok(Judged {
             imagined_return: mean,
             standard_error: std / n.sqrt(),
             survival: steps.concat().iter().sum::<usize>() as f64 / (n * self.limit as f64),
-            distance: if visited.is_empty() { f64::INFINITY } else { median(distances(&visited, t)?) / self.spacing },
+            distance: if visited.is_empty() { f64::INFINITY } else { median(distances) / self.spacing },
+            supported_return: mean_std(&supported).0,
             action_error: rmse(&actions, &t.actions),
             returns,
+            supported_returns: supported,
         })
     }
 }
