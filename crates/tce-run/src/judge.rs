@@ -12,7 +12,7 @@
 //! | survival | share of the steps of whole episodes that were reached |
 //! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
 //! | action error | RMSE of the policy's actions at target states against the behaviour's |
-//! | fitted Q | discounted return from the starts of the target's episodes, by [`tce_learn::fitted_q`]: no model of the dynamics |
+//! | fitted Q | discounted return from the starts of the target's episodes, by [`mod@tce_learn::fitted_q`]: no model of the dynamics |
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
