@@ -3,12 +3,14 @@
 //! A policy is tried in a learned model of the target's dynamics ([`tce_learn::dynamics`]: both domains' rows, the domain as an
 //! input). An imagined episode begins at a target state, keeps to one network of the ensemble, and ends where the network says that
 //! the state is terminal, where the state has left everything that either robot has been seen in, or after as many steps as the longest
-//! target episode has.
+//! target episode has. Its return counts until it is far from every target state ([`FAR`]): beyond, the networks say anything. On
+//! HalfCheetah, kinematic, a policy of 686 returned 5396 there and one of 3130 returned 5276; counted so they return 926 and 1985. What
+//! it does after that is worth the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early must not pay.
+//! Halting where the data end is MOReL's (Kidambi et al. 2020).
 //!
 //! | figure | meaning |
 //! |---|---|
-//! | imagined return | mean return of the imagined episodes, per step of a whole episode |
-//! | supported return | the same until the episode first leaves the target's states: is further from the nearest one than [`FAR`] times the median distance between target rows of different episodes |
+//! | imagined return | mean return of the imagined episodes |
 //! | survival | share of the steps of whole episodes that were reached |
 //! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
 //! | action error | RMSE of the policy's actions at target states against the behaviour's |
@@ -36,8 +38,11 @@ use crate::stage::Stage;
 const STARTS: usize = 32;
 /// Share of the target rows that the ensemble does not see.
 const HELD_OUT: f64 = 0.05;
-/// A state this many times further from the target's states than these are from those of other episodes is not one that the models know.
-pub const FAR: f64 = 5.0;
+/// A state is far from the target's states if its distance to the nearest one is more than so many times the median distance between
+/// target states of different episodes.
+pub const FAR: f64 = 20.0;
+/// The quantile of the target's rewards that stands for the worst one: a single odd row decides nothing.
+const WORST: f64 = 0.01;
 /// A state further outside of everything seen than this share of a column's range ends an imagined episode.
 const MARGIN: f32 = 0.25;
 
@@ -67,8 +72,6 @@ pub struct Judged {
     pub imagined_return: f64,
     /// Standard error of it, over the networks and the starts.
     pub standard_error: f64,
-    /// Mean return until the episodes leave the target's states.
-    pub supported_return: f64,
     /// Mean share of the steps of a whole episode.
     pub survival: f64,
     /// Median distance to the nearest target state.
@@ -77,8 +80,6 @@ pub struct Judged {
     pub action_error: f64,
     /// The return of every imagined episode, networks one after the other.
     pub returns: Vec<f64>,
-    /// The same until it leaves the target's states.
-    pub supported_returns: Vec<f64>,
 }
 
 impl Judge {
@@ -162,8 +163,9 @@ impl Judge {
         let mut returns = vec![vec![0.0; lanes]; networks];
         let mut steps = vec![vec![0usize; lanes]; networks];
         let mut visited = Transitions::new(width, 1);
-        // The episode of every visited state, and its return up to there.
-        let mut passed: Vec<(usize, f64)> = Vec::new();
+        // The episode of every visited state, with its return and steps up to there.
+        let mut passed: Vec<(usize, Left)> = Vec::new();
+        let mut left: Vec<Option<Left>> = vec![None; networks * lanes];
         for step in 0..self.limit {
             if alive.iter().flatten().all(|a| !a) {
                 break;
@@ -192,9 +194,12 @@ impl Judge {
                     policy.reward(&mut memories[k][lane], reward);
                     steps[k][lane] += 1;
                     alive[k][lane] = inside && !prediction.terminals[lane];
+                    if !inside {
+                        left[k * lanes + lane] = Some(Left { so_far: returns[k][lane], steps: steps[k][lane] });
+                    }
                     if inside && step % 10 == 0 {
                         visited.push(next, &[0.0], 0.0, next, false, true);
-                        passed.push((k * lanes + lane, returns[k][lane]));
+                        passed.push((k * lanes + lane, Left { so_far: returns[k][lane], steps: steps[k][lane] }));
                     }
                 }
                 // Lanes that are over stay where they are: what the networks say of them is not looked at.
@@ -209,14 +214,15 @@ impl Judge {
         let returns = returns.concat();
         let n = returns.len() as f64;
         let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t)? };
-        let far = std::env::var("TCE_FAR").ok().and_then(|f| f.parse().ok()).unwrap_or(FAR) * self.spacing;
-        let mut supported: Vec<Option<f64>> = vec![None; returns.len()];
-        for (&distance, &(episode, so_far)) in distances.iter().zip(&passed) {
-            if f64::from(distance) > far {
-                supported[episode].get_or_insert(so_far);
+        for (&distance, &(episode, here)) in distances.iter().zip(&passed) {
+            let earlier = left[episode].is_none_or(|l| here.steps < l.steps);
+            if earlier && f64::from(distance) > FAR * self.spacing {
+                left[episode] = Some(here);
             }
         }
-        let supported: Vec<f64> = supported.iter().zip(&returns).map(|(s, whole)| s.unwrap_or(*whole)).collect();
+        let worst = worst_reward(t);
+        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(worst, self.limit));
+        let returns: Vec<f64> = returns.iter().zip(&left).map(count).collect();
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
         Ok(Judged {
@@ -224,10 +230,8 @@ impl Judge {
             standard_error: std / n.sqrt(),
             survival: steps.concat().iter().sum::<usize>() as f64 / (n * self.limit as f64),
             distance: if visited.is_empty() { f64::INFINITY } else { median(distances) / self.spacing },
-            supported_return: mean_std(&supported).0,
             action_error: rmse(&actions, &t.actions),
             returns,
-            supported_returns: supported,
         })
     }
 }
@@ -285,6 +289,29 @@ impl Judge {
     }
 }
 
+/// Where an imagined episode left the states that the models know.
+#[derive(Clone, Copy, Debug)]
+struct Left {
+    /// Its return up to there.
+    so_far: f64,
+    /// Its steps up to there.
+    steps: usize,
+}
+
+impl Left {
+    /// Its return, where every further one of `limit` steps is worth `worst`.
+    fn counted(self, worst: f64, limit: usize) -> f64 {
+        self.so_far + worst * limit.saturating_sub(self.steps) as f64
+    }
+}
+
+/// The reward of a step that nobody knows anything of: 0, or less where the target's rows have such rewards.
+fn worst_reward(target: &Transitions) -> f64 {
+    let mut rewards = target.rewards.clone();
+    rewards.sort_by(f32::total_cmp);
+    rewards.get((rewards.len() as f64 * WORST) as usize).map_or(0.0, |&r| f64::from(r).min(0.0))
+}
+
 /// Where imagined episodes begin: the first states of all target episodes, and evenly spaced ones.
 fn starts(target: &Transitions) -> Vec<usize> {
     let mut rows: Vec<usize> = target.episodes().iter().map(|e| e.start).take(STARTS).collect();
@@ -334,5 +361,23 @@ fn spacing(target: &Transitions) -> f64 {
     match distances(&target.select(&one), &target.select(&rest)) {
         Ok(distances) => median(distances).max(1e-6),
         Err(_) => 1.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn leaving_the_data_early_never_pays() {
+        let rewards = |reward: f32| {
+            let mut t = Transitions::new(1, 1);
+            (0..200).for_each(|k| t.push(&[0.0], &[0.0], if k == 7 { -1e6 } else { reward }, &[0.0], false, false));
+            worst_reward(&t)
+        };
+        // Rewards above 0: what is left is worth nothing, and one odd row does not change that.
+        assert_eq!(Left { so_far: 30.0, steps: 10 }.counted(rewards(3.0), 100), 30.0);
+        // Costs: an episode that leaves after 10 steps costs as much as one that stays.
+        assert_eq!(Left { so_far: -20.0, steps: 10 }.counted(rewards(-2.0), 100), -200.0);
     }
 }
