@@ -169,6 +169,8 @@ impl Config {
         for plan in [until_done.state(), until_done.transition()] {
             plan.check().map_err(|e| Error::Usage(format!("generator.until_done: {e}")))?;
         }
+        within("fitted_q.discount", self.fitted_q.discount, 0.0, 0.9999)?;
+        within("fitted_q.polyak", self.fitted_q.polyak, 0.0, 1.0)?;
         within("mixture.lambda", self.mixture.lambda, 0.0, 1.0)?;
         within("learner.top", self.learner.top, 0.001, 1.0)?;
         within("filter.z_threshold", self.filter.z_threshold, 0.1, 1e9)?;

@@ -5,7 +5,7 @@
 //! V   = mean over the episodes' first states of (Q₁ + Q₂)(s₀, π(s₀)) / 2
 //! ```
 //!
-//! The networks learn Q - c, where c = mean reward / (1 - γ) is what the rows' behaviour would be worth if it went on for ever. A value
+//! The networks learn Q - c, where c is the mean discounted return of the logged episodes ([`discounted_return`]). A value
 //! spreads backwards by one step per pass of Q' after Q, a hundred steps at γ = .99; a critic that begins at 0 is far below the truth
 //! for tens of thousands of updates, and one that begins at c is not.
 //!
@@ -65,6 +65,18 @@ pub struct FittedQConfig {
 }
 
 impl FittedQConfig {
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self) -> Result<(), LearnError> {
+        within("discount", self.discount, 0.0..=0.9999)?;
+        within("polyak", self.polyak, 0.0..=1.0)?;
+        within("lr", self.lr, 0.0..=1.0)?;
+        within("batch", self.batch as f64, 1.0..=1e9)?;
+        within("replicates", self.replicates as f64, 1.0..=1e3)
+    }
+
     /// Whether every value is the usual one.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
@@ -166,7 +178,7 @@ fn bootstrap(rows: usize, streams: &Streams, replicate: u64) -> Vec<usize> {
 /// Every policy sees the same draws of the rows, so that values of two policies can be compared replicate by replicate.
 ///
 /// # Errors
-/// If the discount is not below 1, the rows cannot be learned from, or a checkpoint cannot be read or written.
+/// If a number is out of range, the rows cannot be learned from, or a checkpoint cannot be read or written.
 ///
 /// # Panics
 /// If a policy's actions do not fit the rows and the starts.
@@ -182,7 +194,7 @@ pub fn fitted_q(
     let width = rows.act_dim;
     let fits = |p: &PolicyActions| p.next.len() == rows.len() * width && p.start.len() == starts.len() * width;
     assert!(policies.iter().all(fits), "actions of every successor and every start");
-    within("discount", config.discount, 0.0..=0.9999)?;
+    config.check()?;
     let standardizer = Standardizer::fit(&rows.observations, rows.obs_dim);
     let draw = |replicate: usize| {
         let picked = bootstrap(rows.len(), &streams, replicate as u64);
@@ -195,8 +207,7 @@ pub fn fitted_q(
         };
         Ok((picked, Buffer::new(vec![member], config.batch)?))
     };
-    let constant =
-        rows.rewards.iter().map(|&r| f64::from(r)).sum::<f64>() / (rows.len() as f64 * (1.0 - config.discount));
+    let constant = discounted_return(rows, config.discount);
     let draws = (0..config.replicates).map(draw).collect::<Result<Vec<_>, LearnError>>()?;
     let mut learners = Vec::new();
     for policy in policies {
