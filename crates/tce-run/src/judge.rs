@@ -211,18 +211,9 @@ impl Judge {
                 }
             }
         }
-        let returns = returns.concat();
-        let n = returns.len() as f64;
         let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t)? };
-        for (&distance, &(episode, here)) in distances.iter().zip(&passed) {
-            let earlier = left[episode].is_none_or(|l| here.steps < l.steps);
-            if earlier && f64::from(distance) > FAR * self.spacing {
-                left[episode] = Some(here);
-            }
-        }
-        let worst = worst_reward(t);
-        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(worst, self.limit));
-        let returns: Vec<f64> = returns.iter().zip(&left).map(count).collect();
+        let returns = self.counted(&returns.concat(), left, &distances, &passed);
+        let n = returns.len() as f64;
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
         Ok(Judged {
@@ -237,6 +228,26 @@ impl Judge {
 }
 
 impl Judge {
+    /// The returns of episodes until they leave what the models know: where they `left` its bounds, or where one of the states that they
+    /// `passed` is far from the target's, whichever comes first. `distances` are those of the passed states, in the order of the steps.
+    fn counted(
+        &self,
+        returns: &[f64],
+        mut left: Vec<Option<Left>>,
+        distances: &[f32],
+        passed: &[(usize, Left)],
+    ) -> Vec<f64> {
+        for (&distance, &(episode, here)) in distances.iter().zip(passed) {
+            let earlier = left[episode].is_none_or(|l| here.steps < l.steps);
+            if earlier && f64::from(distance) > FAR * self.spacing {
+                left[episode] = Some(here);
+            }
+        }
+        let worst = worst_reward(&self.target);
+        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(worst, self.limit));
+        returns.iter().zip(&left).map(count).collect()
+    }
+
     /// The mean actions of a policy, in the box of the rows. A policy that remembers its episode acts as in a first state.
     fn actions_at(&self, policy: &Policy, observations: &[f32]) -> Vec<f32> {
         let mut actions = vec![0.0; observations.len() / self.target.obs_dim * self.target.act_dim];
