@@ -243,6 +243,7 @@ mod tests {
         Judged {
             imagined_return: mean,
             standard_error: std,
+            supported_return: mean,
             survival: 1.0,
             distance: 1.0,
             action_error: 0.1,

@@ -104,15 +104,17 @@ fn render(report: &Report) -> String {
         [
             l.policy.display().to_string(),
             format!("{:.0} ± {:.0}", j.imagined_return, j.standard_error),
+            format!("{:.0}", j.supported_return),
             format!("{:.0} %", 100.0 * j.survival),
             format!("{:.2}", j.distance),
             l.fitted_q.as_ref().map_or("-".into(), |v| format!("{:.1} ± {:.1}", v.mean(), v.standard_error())),
             format!("{:.3}", j.action_error),
         ]
     });
-    let header = ["policy", "imagined return", "survival", "distance", "fitted Q", "action error"];
+    let header = ["policy", "imagined return", "supported", "survival", "distance", "fitted Q", "action error"];
     format!(
         "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n{}\n\
+         supported: the imagined return until an episode is far from the target's states\n\
          fitted Q: return with each later reward worth 1 % less; the target's logged episodes have {:.1}",
         report.held_out[0],
         report.held_out[1],
