@@ -169,8 +169,7 @@ impl Config {
         for plan in [until_done.state(), until_done.transition()] {
             plan.check().map_err(|e| Error::Usage(format!("generator.until_done: {e}")))?;
         }
-        within("fitted_q.discount", self.fitted_q.discount, 0.0, 0.9999)?;
-        within("fitted_q.polyak", self.fitted_q.polyak, 0.0, 1.0)?;
+        self.fitted_q.check().map_err(|e| Error::Usage(format!("fitted_q.{e}")))?;
         within("mixture.lambda", self.mixture.lambda, 0.0, 1.0)?;
         within("learner.top", self.learner.top, 0.001, 1.0)?;
         within("filter.z_threshold", self.filter.z_threshold, 0.1, 1e9)?;
@@ -179,8 +178,6 @@ impl Config {
             ("source.rows", self.source.rows),
             ("generator.batch", self.generator.batch),
             ("dynamics.batch", self.dynamics.batch),
-            ("fitted_q.batch", self.fitted_q.batch),
-            ("fitted_q.replicates", self.fitted_q.replicates),
             ("labels.training.batch", self.labels.training.batch),
             ("learner.batch", self.learner.batch),
             ("learner.steps", usize::try_from(self.learner.steps).unwrap_or(usize::MAX)),

@@ -66,6 +66,8 @@ pub struct Judge {
     /// The units of the policies' actions, where they are not the box.
     actions: Option<ActionRange>,
     spacing: f64,
+    /// The reward of a step that nobody knows anything of.
+    worst: f64,
 }
 
 /// What a policy does in the learned model.
@@ -134,6 +136,7 @@ impl Judge {
             root: root.to_owned(),
             inputs: inputs.spec(false),
             spacing: spacing(target),
+            worst: worst_reward(target),
             target: Arc::new(target.clone()),
             low,
             high,
@@ -161,8 +164,7 @@ impl Judge {
         let starts = starts(t);
         let networks = self.dynamics.members();
         let (lanes, width, act) = (starts.len(), t.obs_dim, t.act_dim);
-        let first: Vec<f32> = starts.iter().flat_map(|&i| t.observation(i).iter().copied()).collect();
-        let mut states = vec![first; networks];
+        let mut states = vec![t.select(&starts).observations; networks];
         let mut memories = vec![vec![policy.start(); lanes]; networks];
         let mut alive = vec![vec![true; lanes]; networks];
         let mut returns = vec![vec![0.0; lanes]; networks];
@@ -178,9 +180,7 @@ impl Judge {
             let act_in = |(states, memories): (&Vec<f32>, &mut Vec<_>)| {
                 let mut actions = vec![0.0; lanes * act];
                 policy.act_with(states, memories, None, &mut actions);
-                self.actions.iter().for_each(|range| range.to_unit(&mut actions));
-                actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
-                actions
+                self.in_box(actions)
             };
             let actions: Vec<Vec<f32>> = states.par_iter().zip(memories.par_iter_mut()).map(act_in).collect();
             let tables: Vec<(&[f32], &[f32])> =
@@ -199,12 +199,12 @@ impl Judge {
                     policy.reward(&mut memories[k][lane], reward);
                     steps[k][lane] += 1;
                     alive[k][lane] = inside && !prediction.terminals[lane];
+                    let (episode, here) = (k * lanes + lane, Left { so_far: returns[k][lane], steps: steps[k][lane] });
                     if !inside {
-                        left[k * lanes + lane] = Some(Left { so_far: returns[k][lane], steps: steps[k][lane] });
-                    }
-                    if inside && step % 10 == 0 {
+                        left[episode] = Some(here);
+                    } else if step % 10 == 0 {
                         visited.push(next, &[0.0], 0.0, next, false, true);
-                        passed.push((k * lanes + lane, Left { so_far: returns[k][lane], steps: steps[k][lane] }));
+                        passed.push((episode, here));
                     }
                 }
                 // Lanes that are over stay where they are: what the networks say of them is not looked at.
@@ -250,8 +250,7 @@ impl Judge {
                 left[episode] = Some(here);
             }
         }
-        let worst = worst_reward(&self.target);
-        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(worst, self.limit));
+        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(self.worst, self.limit));
         returns.iter().zip(&left).map(count).collect()
     }
 
@@ -259,6 +258,11 @@ impl Judge {
     fn actions_at(&self, policy: &Policy, observations: &[f32]) -> Vec<f32> {
         let mut actions = vec![0.0; observations.len() / self.target.obs_dim * self.target.act_dim];
         policy.act(observations, None, &mut actions);
+        self.in_box(actions)
+    }
+
+    /// A policy's actions in the box of the rows.
+    fn in_box(&self, mut actions: Vec<f32>) -> Vec<f32> {
         self.actions.iter().for_each(|range| range.to_unit(&mut actions));
         actions.iter_mut().for_each(|a| *a = a.clamp(-1.0, 1.0));
         actions
@@ -277,7 +281,7 @@ impl Judge {
         }
         let t = &self.target;
         let starts: Vec<usize> = t.episodes().iter().map(|e| e.start).collect();
-        let first: Vec<f32> = starts.iter().flat_map(|&i| t.observation(i).iter().copied()).collect();
+        let first = t.select(&starts).observations;
         let actions = |policy: &Policy| PolicyActions {
             next: self.actions_at(policy, &t.next_observations),
             start: self.actions_at(policy, &first),

@@ -128,14 +128,14 @@ pub fn recommend(
     let judge = judge()?;
     tce_base::begin_step("verdict");
     let progress = Progress::new("try policies", candidates.iter().map(|c| c.files.len() as u64).sum(), "policies");
-    let try_one = |file: &PathBuf| judge.judge(&Policy::load(file)?).inspect(|_| progress.inc(1));
-    let try_all = |c: &Candidate| c.files.iter().map(try_one).collect::<Result<Vec<_>>>();
-    let judged = candidates.iter().map(try_all).collect::<Result<Vec<_>>>()?;
+    let load_all = |c: &Candidate| c.files.iter().map(|file| Ok(Policy::load(file)?)).collect::<Result<Vec<_>>>();
+    let policies = candidates.iter().map(load_all).collect::<Result<Vec<_>>>()?;
+    let try_one = |policy: &Policy| judge.judge(policy).inspect(|_| progress.inc(1));
+    let judged = policies.iter().map(|own| own.iter().map(try_one).collect()).collect::<Result<Vec<Vec<_>>>>()?;
     progress.finish();
     let mut verdict = decide(candidates, &judged)?;
     if let Some((config, device)) = fitted_q {
-        let policies = candidates.iter().flat_map(|c| &c.files).map(|f| Ok(Policy::load(f)?));
-        let values = judge.values(&policies.collect::<Result<Vec<_>>>()?, config, device)?;
+        let values = judge.values(&policies.concat(), config, device)?;
         let mut values = values.iter();
         for (tried, candidate) in verdict.tried.iter_mut().zip(candidates) {
             let own: Vec<&FittedValue> = values.by_ref().take(candidate.files.len()).collect();

@@ -166,6 +166,10 @@ fn prefix(k: usize) -> String {
 impl Learner for Bc {
     fn update(&mut self, batch: &Minibatch, at: u64, meter: &mut Meter) {
         let masks = |k: usize| -> Vec<Dropout> {
+            if self.dropout == 0.0 {
+                // A generator for each update and policy is not free.
+                return Vec::new();
+            }
             let name = format!("dropout {k}");
             self.members.iter().map(|m| Dropout::new(self.dropout, m.indexed(&name, at))).collect()
         };

@@ -28,7 +28,7 @@ use std::sync::Arc;
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
+use tce_base::{Streams, mean_std};
 use tce_data::{Standardizer, Transitions};
 use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, host, tensor};
 
@@ -108,13 +108,12 @@ pub struct FittedValue {
 impl FittedValue {
     /// Mean over the replicates.
     pub fn mean(&self) -> f64 {
-        self.replicates.iter().sum::<f64>() / self.replicates.len() as f64
+        mean_std(&self.replicates).0
     }
 
     /// Standard deviation over the replicates: the bootstrap's standard error of one of them. NaN for fewer than two.
     pub fn standard_error(&self) -> f64 {
-        let (n, mean) = (self.replicates.len() as f64, self.mean());
-        (self.replicates.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt()
+        if self.replicates.len() < 2 { f64::NAN } else { mean_std(&self.replicates).1 }
     }
 }
 
@@ -229,7 +228,7 @@ pub fn fitted_q(
     if outcome.interrupted {
         return Ok(None);
     }
-    let observations: Vec<f32> = starts.iter().flat_map(|&i| rows.observation(i).iter().copied()).collect();
+    let observations = rows.select(starts).observations;
     let value = |(k, learner): (usize, &FittedQ)| {
         let buffer = &draws[k % config.replicates].1;
         let inputs = buffer.network_inputs(0, &observations);

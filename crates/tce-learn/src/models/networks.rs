@@ -107,29 +107,21 @@ impl Dropout {
 
     /// Each member of a population `[P, ...]` with its own next mask. All of them have the same rate.
     pub(crate) fn apply_members<const D: usize>(members: &mut [Self], x: Tensor<D>) -> Tensor<D> {
-        if members.iter().all(|m| m.rng.is_none() || m.dropped == 0) {
+        let dropped = members.first().filter(|m| m.rng.is_some()).map_or(0, |m| m.dropped);
+        if dropped == 0 {
             return x;
         }
         let dims = x.dims();
-        let share = dims.iter().product::<usize>() / members.len();
-        let mut mask = Vec::with_capacity(share * members.len());
-        members.iter_mut().for_each(|member| member.draw(share, &mut mask));
+        // Two bytes an element: a float each would cost twice the time, which is a tenth of an update.
+        let mut bytes = vec![0; 2 * dims.iter().product::<usize>()];
+        let share = bytes.len() / members.len();
+        let rngs = members.iter_mut().filter_map(|m| m.rng.as_mut());
+        rngs.zip(bytes.chunks_exact_mut(share)).for_each(|(rng, bytes)| rng.fill_bytes(bytes));
+        let kept = 65536.0 / (65536 - dropped) as f32;
+        let draws = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
+        let mask: Vec<f32> = draws.map(|draw| if draw < dropped { 0.0 } else { kept }).collect();
         let device = x.device().inner();
         x * Tensor::from_inner(Tensor::from_data(TensorData::new(mask, dims), &device))
-    }
-
-    /// Appends the next mask of `len` elements.
-    fn draw(&mut self, len: usize, mask: &mut Vec<f32>) {
-        let Some(rng) = self.rng.as_mut().filter(|_| self.dropped > 0) else {
-            mask.resize(mask.len() + len, 1.0);
-            return;
-        };
-        // Two bytes an element: a float each would cost twice the time, which is a tenth of an update.
-        let mut bytes = vec![0; 2 * len];
-        rng.fill_bytes(&mut bytes);
-        let kept = 65536.0 / (65536 - self.dropped) as f32;
-        let draws = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
-        mask.extend(draws.map(|draw| if draw < self.dropped { 0.0 } else { kept }));
     }
 }
 

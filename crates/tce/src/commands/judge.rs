@@ -85,11 +85,8 @@ impl JudgeArgs {
         let lines = lines.map(|((path, policy), fitted_q)| {
             Ok(Line { policy: path.clone(), judged: judge.judge(policy)?, fitted_q })
         });
-        let at = |q: f64| {
-            judge.held_out.get(((judge.held_out.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(f64::NAN)
-        };
         let report = Report {
-            held_out: [at(0.5), at(0.95)],
+            held_out: [judge.held_out_error(0.5), judge.held_out_error(0.95)],
             behaviour_value: judge.behaviour_value(&fitted_q),
             policies: lines.collect::<Result<Vec<_>>>()?,
         };
