@@ -14,8 +14,8 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Mode, Place, Policy, PolicyLearner,
-    best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Method, Mode, Place, Policy,
+    PolicyLearner, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 

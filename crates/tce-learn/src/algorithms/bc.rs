@@ -58,7 +58,14 @@ impl Method for BcConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("dropout", self.dropout, 0.0..=0.9)?;
+        within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
+        if self.ensemble > 1 && self.actor.form != PolicyForm::TanhMean {
+            let (found, remedy) =
+                (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
+            return Err(LearnError::invalid("ensemble", found, "1, or policies without noise of their own", remedy));
+        }
+        Ok(())
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -66,7 +73,10 @@ impl Method for BcConfig {
     }
 
     fn steps(&self, steps: u64, mixed: bool) -> u64 {
-        self.steps(steps, mixed)
+        match self.mixed_steps {
+            most if mixed && most > 0 => steps.min(most),
+            _ => steps,
+        }
     }
 }
 
@@ -97,31 +107,6 @@ impl Default for BcConfig {
 // The keys of runs that were done before there was dropout do not name it.
 fn no_dropout(rate: &f64) -> bool {
     *rate == 0.0
-}
-
-impl BcConfig {
-    /// The steps of a training that is to take `steps`, by whether it has rows besides the target's.
-    pub fn steps(&self, steps: u64, mixed: bool) -> u64 {
-        match self.mixed_steps {
-            most if mixed && most > 0 => steps.min(most),
-            _ => steps,
-        }
-    }
-
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("dropout", self.dropout, 0.0..=0.9)?;
-        within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
-        if self.ensemble > 1 && self.actor.form != PolicyForm::TanhMean {
-            let (found, remedy) =
-                (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
-            return Err(LearnError::invalid("ensemble", found, "1, or policies without noise of their own", remedy));
-        }
-        Ok(())
-    }
 }
 
 /// Behaviour cloning of a population.

@@ -65,7 +65,15 @@ impl Method for BosaConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("threshold", self.threshold, f64::MIN_POSITIVE..=1e30)?;
+        within("value_weight", self.value_weight, 0.0..=1e6)?;
+        within("support_weight", self.support_weight, 0.0..=1e6)?;
+        within("ensemble", self.ensemble as f64, 1.0..=1e3)?;
+        within("samples", self.samples as f64, 1.0..=1e4)?;
+        within("std", self.std, f64::MIN_POSITIVE..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -139,22 +147,6 @@ impl Default for BosaConfig {
 }
 
 impl BosaConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("threshold", self.threshold, f64::MIN_POSITIVE..=1e30)?;
-        within("value_weight", self.value_weight, 0.0..=1e6)?;
-        within("support_weight", self.support_weight, 0.0..=1e6)?;
-        within("ensemble", self.ensemble as f64, 1.0..=1e3)?;
-        within("samples", self.samples as f64, 1.0..=1e4)?;
-        within("std", self.std, f64::MIN_POSITIVE..=1e6)?;
-        within("discount", self.discount, 0.0..=1.0)?;
-        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
-        self.delay.check()
-    }
-
     fn density(&self) -> Density {
         Density { samples: self.samples, std: self.std, importance: true }
     }

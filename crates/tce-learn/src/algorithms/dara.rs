@@ -56,7 +56,10 @@ impl Method for DaraConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("eta", self.eta, 0.0..=1e6)?;
+        within("clip", self.clip, 0.0..=1e6)?;
+        within("noise", self.noise, 0.0..=1e6)?;
+        within("lr", self.lr, 0.0..=1.0)
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -101,19 +104,6 @@ pub struct DaraConfig {
 impl Default for DaraConfig {
     fn default() -> Self {
         Self { mode: Mode::default(), eta: 0.1, clip: 10.0, noise: 1.0, hidden: vec![256, 256], lr: 3e-4 }
-    }
-}
-
-impl DaraConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("eta", self.eta, 0.0..=1e6)?;
-        within("clip", self.clip, 0.0..=1e6)?;
-        within("noise", self.noise, 0.0..=1e6)?;
-        within("lr", self.lr, 0.0..=1.0)
     }
 }
 

@@ -60,7 +60,8 @@ impl Method for DmcConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("cut_off", self.cut_off, 0.0..=1.0)?;
+        within("beta_reg", self.beta_reg, 0.0..=1e6)
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -77,7 +78,12 @@ impl Method for DmcConfig {
     }
 
     fn behaviour(&self, base: &RegulariserConfig) -> RegulariserConfig {
-        self.behaviour(base)
+        let mut behaviour = base.clone();
+        // The public code never trains the behaviour CVAE.
+        if self.mode == Mode::Published {
+            behaviour.cvae.steps = 0;
+        }
+        behaviour
     }
 }
 
@@ -102,27 +108,9 @@ impl Default for DmcConfig {
 }
 
 impl DmcConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("cut_off", self.cut_off, 0.0..=1.0)?;
-        within("beta_reg", self.beta_reg, 0.0..=1e6)
-    }
-
     /// `base` with what DmC takes over from OTDF: its policy and regulariser, and the policy extraction of the mode.
     pub fn backbone(&self, base: &IqlConfig) -> IqlConfig {
         otdf_policy(base, self.mode, self.beta_reg)
-    }
-
-    /// `base` with the training of the behaviour CVAE that the mode has: none in `published`.
-    pub fn behaviour(&self, base: &RegulariserConfig) -> RegulariserConfig {
-        let mut behaviour = base.clone();
-        if self.mode == Mode::Published {
-            behaviour.cvae.steps = 0;
-        }
-        behaviour
     }
 }
 

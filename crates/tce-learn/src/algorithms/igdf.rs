@@ -58,7 +58,11 @@ impl Method for IgdfConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("keep", self.keep, 0.0..=1.0)?;
+        within("weight", self.weight, 0.0..=1e3)?;
+        within("features", self.features as f64, 1.0..=1e5)?;
+        within("lr", self.lr, 0.0..=1.0)?;
+        within("batch", self.batch as f64, 2.0..=1e6)
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -128,18 +132,6 @@ impl IgdfConfig {
     /// Whether the defect of `code` is trained with.
     fn as_in(&self, code: Code) -> bool {
         self.mode == Mode::Published && self.code == code
-    }
-
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("keep", self.keep, 0.0..=1.0)?;
-        within("weight", self.weight, 0.0..=1e3)?;
-        within("features", self.features as f64, 1.0..=1e5)?;
-        within("lr", self.lr, 0.0..=1.0)?;
-        within("batch", self.batch as f64, 2.0..=1e6)
     }
 }
 

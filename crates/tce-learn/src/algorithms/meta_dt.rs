@@ -64,7 +64,24 @@ impl Method for MetaDtConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("context", self.context as f64, 1.0..=MAX_CONTEXT as f64)?;
+        for (field, value) in
+            [("embed", self.embed), ("layers", self.layers), ("heads", self.heads), ("batch", self.batch)]
+        {
+            within(field, value as f64, 1.0..=65536.0)?;
+        }
+        within("timesteps", self.timesteps as f64, 1.0..=1e7)?;
+        within("dropout", self.dropout, 0.0..=0.99)?;
+        within("lr", self.lr, 0.0..=1.0)?;
+        within("weight_decay", self.weight_decay, 0.0..=1e3)?;
+        within("grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
+        within("return_scale", self.return_scale, f64::MIN_POSITIVE..=1e12)?;
+        within("return_factor", self.return_factor, -1e6..=1e6)?;
+        if !self.embed.is_multiple_of(self.heads) {
+            let expected = format!("a divisor of embed = {}", self.embed);
+            return Err(LearnError::invalid("heads", self.heads, expected, "correct the configuration"));
+        }
+        self.world_model.check()
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -142,31 +159,6 @@ impl Default for MetaDtConfig {
 }
 
 impl MetaDtConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("context", self.context as f64, 1.0..=MAX_CONTEXT as f64)?;
-        for (field, value) in
-            [("embed", self.embed), ("layers", self.layers), ("heads", self.heads), ("batch", self.batch)]
-        {
-            within(field, value as f64, 1.0..=65536.0)?;
-        }
-        within("timesteps", self.timesteps as f64, 1.0..=1e7)?;
-        within("dropout", self.dropout, 0.0..=0.99)?;
-        within("lr", self.lr, 0.0..=1.0)?;
-        within("weight_decay", self.weight_decay, 0.0..=1e3)?;
-        within("grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
-        within("return_scale", self.return_scale, f64::MIN_POSITIVE..=1e12)?;
-        within("return_factor", self.return_factor, -1e6..=1e6)?;
-        if !self.embed.is_multiple_of(self.heads) {
-            let expected = format!("a divisor of embed = {}", self.embed);
-            return Err(LearnError::invalid("heads", self.heads, expected, "correct the configuration"));
-        }
-        self.world_model.check()
-    }
-
     /// Learning rate of the transformer's step `step`.
     fn rate(&self, step: u64) -> f64 {
         self.lr * ((step + 1) as f64 / self.warm_up.max(1) as f64).min(1.0)

@@ -58,7 +58,8 @@ impl Method for OtdfConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("keep", self.keep, 0.0..=1.0)?;
+        within("beta_reg", self.beta_reg, 0.0..=1e6)
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -99,15 +100,6 @@ impl Default for OtdfConfig {
 }
 
 impl OtdfConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("keep", self.keep, 0.0..=1.0)?;
-        within("beta_reg", self.beta_reg, 0.0..=1e6)
-    }
-
     /// The IQL that this configuration makes of `iql`.
     pub fn backbone(&self, iql: &IqlConfig) -> IqlConfig {
         otdf_policy(iql, self.mode, self.beta_reg)

@@ -49,7 +49,11 @@ impl Method for RebracConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("actor_penalty", self.actor_penalty, 0.0..=1e6)?;
+        within("critic_penalty", self.critic_penalty, 0.0..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -95,20 +99,6 @@ impl Default for RebracConfig {
             actor: ActorConfig { cosine: false, hidden: hidden.clone(), ..ActorConfig::default() },
             hidden,
         }
-    }
-}
-
-impl RebracConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("actor_penalty", self.actor_penalty, 0.0..=1e6)?;
-        within("critic_penalty", self.critic_penalty, 0.0..=1e6)?;
-        within("discount", self.discount, 0.0..=1.0)?;
-        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
-        self.delay.check()
     }
 }
 

@@ -55,7 +55,10 @@ impl Method for SrpoConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("lambda", self.lambda, 0.0..=1e6)?;
+        within("share", self.share, 0.0..=1.0)?;
+        within("clip", self.clip, 1.0..=1e6)?;
+        within("lr", self.lr, 0.0..=1.0)
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -98,19 +101,6 @@ pub struct SrpoConfig {
 impl Default for SrpoConfig {
     fn default() -> Self {
         Self { mode: Mode::default(), lambda: 0.1, share: 0.5, clip: 10.0, hidden: vec![256, 256], lr: 1e-3 }
-    }
-}
-
-impl SrpoConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("lambda", self.lambda, 0.0..=1e6)?;
-        within("share", self.share, 0.0..=1.0)?;
-        within("clip", self.clip, 1.0..=1e6)?;
-        within("lr", self.lr, 0.0..=1.0)
     }
 }
 

@@ -47,7 +47,10 @@ impl Method for Td3BcConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        self.check()
+        within("alpha", self.alpha, 0.0..=1e6)?;
+        within("discount", self.discount, 0.0..=1.0)?;
+        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
+        self.delay.check()
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
@@ -86,19 +89,6 @@ impl Default for Td3BcConfig {
             hidden: vec![256, 256],
             actor: ActorConfig { cosine: false, ..ActorConfig::default() },
         }
-    }
-}
-
-impl Td3BcConfig {
-    /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self) -> Result<(), LearnError> {
-        within("alpha", self.alpha, 0.0..=1e6)?;
-        within("discount", self.discount, 0.0..=1.0)?;
-        within("critic_lr", self.critic_lr, 0.0..=1.0)?;
-        self.delay.check()
     }
 }
 
