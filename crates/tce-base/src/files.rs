@@ -304,6 +304,13 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
+/// The SHA-256 of `parts`, one behind the other.
+pub fn sha256_parts(parts: impl IntoIterator<Item = Vec<u8>>) -> String {
+    let mut hash = Sha256::new();
+    parts.into_iter().for_each(|part| hash.update(&part));
+    hex(&hash.finalize())
+}
+
 /// The SHA-256 of a file, read in pieces.
 pub fn sha256_file(path: &Path) -> Result<String, FileError> {
     let mut file = File::open(path).map_err(|e| FileError::new(path, "open", e))?;
@@ -399,6 +406,7 @@ mod tests {
         write_atomically(&target, b"new").unwrap();
         assert_eq!(fs::read(&target).unwrap(), b"new");
         assert_eq!(sha256_file(&target).unwrap(), sha256_hex(b"new"));
+        assert_eq!(sha256_parts([b"n".to_vec(), b"ew".to_vec()]), sha256_hex(b"new"));
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 }

@@ -26,6 +26,11 @@ pub fn listen_for_interrupts() {
     let _ = std::thread::Builder::new().name("signals".into()).spawn(listen);
 }
 
+/// Asks long work to stop, or takes that back: for a host that has signal handlers of its own, such as Python.
+pub fn set_interrupted(stop: bool) {
+    INTERRUPTED.store(stop, Ordering::Relaxed);
+}
+
 /// Whether the user asked to stop. Long loops ask once per step and leave at the next safe point.
 pub fn interrupted() -> bool {
     INTERRUPTED.load(Ordering::Relaxed)

@@ -18,17 +18,17 @@ pub mod words;
 pub use course::{Headline, Step, begin_step, end_course, plan_course};
 pub use files::{
     AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
-    read_if_there, sha256_file, sha256_hex, write_atomically, write_json, write_json_first,
+    read_if_there, sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
 };
-pub use interrupt::{interrupted, listen_for_interrupts};
+pub use interrupt::{interrupted, listen_for_interrupts, set_interrupted};
 pub use metrics::Metrics;
 pub use owner::Owner;
-pub use progress::Progress;
 pub use random::{Rng, Streams};
 pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use statistics::{mean_std, plus_minus};
-pub use terminal::set_quiet;
+pub use progress::{Progress, Running, running};
+pub use terminal::{set_listener, set_quiet};
 pub use words::{did_you_mean, file_inside, nearest};
 
 /// What files say about who wrote them.

@@ -1,7 +1,7 @@
 //! Long work: a bar with what is left on a terminal, a plain line now and then elsewhere.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
@@ -14,6 +14,36 @@ use crate::terminal::{Counter, LINES, in_place, quiet, say};
 const PLAIN_INTERVAL: Duration = Duration::from_secs(15);
 /// Time between two looks at a bar that does not move, so that what is left does not stand still.
 const TICK: Duration = Duration::from_millis(500);
+
+/// What has been begun and is not over.
+static RUNNING: Mutex<Vec<(Weak<Counter>, &'static str)>> = Mutex::new(Vec::new());
+
+/// How far a piece of work is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Running {
+    /// What it is.
+    pub label: String,
+    /// Units that are done.
+    pub done: u64,
+    /// All units.
+    pub total: u64,
+    /// What is counted ("rows", "steps").
+    pub unit: &'static str,
+    /// Seconds since it began.
+    pub seconds: f64,
+}
+
+/// The pieces of work that are under way, the oldest first: for a host that shows progress in its own way.
+pub fn running() -> Vec<Running> {
+    let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
+    running.retain(|(counter, _)| counter.strong_count() > 0);
+    let tell = |(counter, unit): &(Weak<Counter>, &'static str)| {
+        let counter = counter.upgrade()?;
+        let (done, seconds) = (counter.done.load(Ordering::Relaxed), counter.started.elapsed().as_secs_f64());
+        Some(Running { label: counter.label.clone(), done, total: counter.total, unit, seconds })
+    };
+    running.iter().filter_map(tell).collect()
+}
 
 /// The progress of one piece of work of known length. Cheap to call often; safe to share between threads. A bar that is dropped before
 /// its end leaves no line.
@@ -47,6 +77,10 @@ impl Progress {
         let started = Instant::now();
         let counter = Arc::new(Counter { label, total, done: AtomicU64::new(0), started });
         course::works(&counter);
+        let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
+        running.retain(|(counter, _)| counter.strong_count() > 0);
+        running.push((Arc::downgrade(&counter), unit));
+        drop(running);
         let bar = in_place().then(|| {
             let bar = ProgressBar::new(total).with_prefix(counter.label.clone()).with_style(bar_style(even));
             let bar = LINES.add(bar);
@@ -163,6 +197,17 @@ mod tests {
         assert_eq!(done_line("learn bc [0]", 12_000, "steps", 5.4225), "learn bc [0]: 12,000 steps in 5.4 s (2,213/s)");
         assert_eq!(done_line("sweep", 3, "pieces of work", 400.0), "sweep: 3 pieces of work in 6 min 40 s (27.0/h)");
         assert_eq!(done_line("train q_mix", 0, "steps", 0.0), "train q_mix: nothing was left to do");
+    }
+
+    #[test]
+    fn what_runs_is_told_until_it_is_over() {
+        let own = || running().into_iter().find(|r| r.label == "a test of running");
+        let progress = Progress::new("a test of running", 10, "rows");
+        progress.inc(3);
+        let told = own().unwrap();
+        assert_eq!((told.done, told.total, told.unit), (3, 10, "rows"));
+        drop(progress);
+        assert_eq!(own(), None);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What bars, the line above them and notes share: one thing that draws on stderr.
 
 use std::io::IsTerminal;
-use std::sync::LazyLock;
+use std::sync::{LazyLock, PoisonError, RwLock};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Instant;
 
@@ -30,9 +30,22 @@ pub(crate) fn in_place() -> bool {
     *TERMINAL && !quiet()
 }
 
+/// Who gets the notes in place of stderr.
+type Listener = Box<dyn Fn(&str) + Send + Sync>;
+
+static LISTENER: RwLock<Option<Listener>> = RwLock::new(None);
+
+/// From now on notes go to `listener` instead of stderr; None: to stderr again. For a host with a log of its own, such as Python.
+pub fn set_listener(listener: Option<Listener>) {
+    *LISTENER.write().unwrap_or_else(PoisonError::into_inner) = listener;
+}
+
 /// A line of text on stderr, above all bars. Written by [`note!`](crate::note).
 #[doc(hidden)]
 pub fn say(text: &str) {
+    if let Some(listener) = &*LISTENER.read().unwrap_or_else(PoisonError::into_inner) {
+        return listener(text);
+    }
     let print = || match text.strip_prefix("warning:") {
         Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
         None => eprintln!("{text}"),

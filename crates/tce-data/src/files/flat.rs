@@ -15,6 +15,7 @@ use super::formats::{Format, Raw};
 use super::hdf5::{Column, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
+use super::successors::{fill_gaps, layout_of, told_gaps};
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem};
 
@@ -52,38 +53,6 @@ fn other_marks(file: &Hdf5, timeouts: Option<&str>) -> Vec<String> {
     let hints =
         hints.map(|name| format!("`{name}` was not read; if it tells where episodes end, store it as `timeouts`"));
     of_two.chain(hints).collect()
-}
-
-/// Puts the state in the place of successors that are not finite, which only terminal rows may have, and marks them as not `known`.
-fn fill_gaps(
-    file: &Hdf5,
-    name: &str,
-    stored: &mut Column,
-    observed: &Column,
-    terminal: &[bool],
-    known: &mut Option<Vec<bool>>,
-    warnings: &mut Vec<String>,
-) -> Result<(), DataError> {
-    let dim = stored.dim;
-    let gaps: Vec<usize> =
-        (0..terminal.len()).filter(|i| stored.data[i * dim..(i + 1) * dim].iter().any(|x| !x.is_finite())).collect();
-    if gaps.iter().any(|&i| !terminal[i]) {
-        // The plain reading says where and what.
-        file.matrix(name)?;
-    }
-    if !gaps.is_empty() {
-        warnings.push(format!(
-            "`{name}` is not finite in {} terminal rows, whose next state is taken as not known",
-            gaps.len()
-        ));
-        let known = known.get_or_insert_with(|| vec![true; terminal.len()]);
-        for i in gaps {
-            known[i] = false;
-            let state = &observed.data[i * dim..(i + 1) * dim];
-            stored.data[i * dim..(i + 1) * dim].copy_from_slice(state);
-        }
-    }
-    Ok(())
 }
 
 impl Format for Flat {
@@ -142,7 +111,11 @@ impl Format for Flat {
         }
         let mut known = known;
         if let Some((name, c)) = next.zip(stored.as_mut()) {
-            fill_gaps(file, name, c, &observed, &terminal, &mut known, &mut warnings)?;
+            match fill_gaps(&mut c.data, &observed.data, &terminal, &mut known) {
+                // The plain reading says where and what.
+                Err(_) => drop(file.matrix(name)?),
+                Ok(gaps) => warnings.extend(told_gaps(name, gaps)),
+            }
         }
         if observed.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
             warnings.push("states are stored as float64; they were rounded to float32".to_owned());
@@ -150,8 +123,7 @@ impl Format for Flat {
         let trusted = file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT);
         let layout = match (trusted, &stored, &timeout) {
             (true, Some(_), Some(_)) => Layout::Tce,
-            (_, Some(_), None) => Layout::Otdf,
-            _ => Layout::D4rl,
+            _ => layout_of(stored.is_some(), timeout.is_some()),
         };
         Ok(Raw {
             layout,

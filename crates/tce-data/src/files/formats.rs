@@ -9,6 +9,7 @@
 //! A further layout is a file with a [`Format`] and a line in `FORMATS` of `load.rs`.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use super::hdf5::Hdf5;
 use super::options::LoadOptions;
@@ -47,13 +48,13 @@ pub(super) struct Raw {
 
 impl Raw {
     /// Refuses other dimensions than `dims`.
-    pub fn check_dims(&self, file: &Hdf5, dims: Option<(usize, usize)>) -> Result<(), DataError> {
+    pub fn check_dims(&self, file: &Path, dims: Option<(usize, usize)>) -> Result<(), DataError> {
         let Some((o, a)) = dims else { return Ok(()) };
         let advice = "This is a file of another agent: choose the file, or the agent, that fits";
         for (field, found, expected) in [("observations", self.obs_dim, o), ("actions", self.act_dim, a)] {
             if found != expected {
                 let (found, expected) = (format!("{found} columns"), format!("{expected} columns"));
-                return Err(file.invalid(Problem::Dimension, field, found, expected, advice));
+                return Err(DataError::invalid(Problem::Dimension, file, field, found, expected, advice));
             }
         }
         Ok(())

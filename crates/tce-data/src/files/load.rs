@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::episodes;
 use super::flat::Flat;
-use super::formats::Format;
+use super::formats::{Format, Raw};
 use super::hdf5::Hdf5;
 use super::marks::Table;
 use super::minari::{Minari, main_file};
@@ -37,12 +37,18 @@ pub struct Loaded {
 pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     let file = Hdf5::open(&main_file(path))?;
     let format = FORMATS.into_iter().find(|format| format.recognises(&file)).unwrap_or(&Flat);
-    let raw = format.read(&file, options)?;
-    raw.check_dims(&file, options.dims)?;
-    let (rows, layout, mut columns) = (raw.rewards.len(), raw.layout, raw.columns);
+    let mut raw = format.read(&file, options)?;
     // After the last number is read.
     let mut warnings = file.notes();
-    warnings.extend(raw.warnings);
+    warnings.append(&mut raw.warnings);
+    raw.warnings = warnings;
+    finish(raw, path, options)
+}
+
+/// Rows as they were read, put right: `path` is what messages call them.
+pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
+    raw.check_dims(path, options.dims)?;
+    let (rows, layout, mut columns, mut warnings) = (raw.rewards.len(), raw.layout, raw.columns, raw.warnings);
     let mut transitions = Transitions {
         obs_dim: raw.obs_dim,
         act_dim: raw.act_dim,
@@ -70,7 +76,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     if transitions.is_empty() {
         let found = format!("{rows} rows, none of them with a usable next state");
         let advice = "Add `next_observations`, or use a longer data set";
-        return Err(file.invalid(Problem::Empty, "observations", found, "at least one transition", advice));
+        return Err(DataError::invalid(Problem::Empty, path, "observations", found, "at least one transition", advice));
     }
     let unknown_successors = transitions.known.iter().filter(|&&known| !known).count();
     if unknown_successors > 0 {

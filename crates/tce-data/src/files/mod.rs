@@ -11,6 +11,7 @@
 //! Nothing is used before the whole file has been validated, and no malformed file may panic or make the reader
 //! allocate far beyond the file's own size.
 
+mod columns;
 mod episodes;
 mod episodes_in_groups;
 mod flat;
@@ -26,7 +27,9 @@ mod rows;
 mod save;
 mod save_minari;
 mod steps;
+mod successors;
 
+pub use columns::{Columns, from_columns};
 pub use load::{Loaded, load, read_attributes};
 pub use minari::main_file;
 pub use options::LoadOptions;

@@ -1,0 +1,43 @@
+//! Stored successors that are not finite, and what a table with or without successors and time-outs is.
+
+use super::report::Layout;
+
+/// The layout of a table that nobody vouches for.
+pub(super) fn layout_of(successors: bool, timeouts: bool) -> Layout {
+    match (successors, timeouts) {
+        (true, false) => Layout::Otdf,
+        _ => Layout::D4rl,
+    }
+}
+
+/// Puts the state in the place of successors that are not finite, which only terminal rows may have, and marks them as not `known`. How
+/// many there were.
+///
+/// # Errors
+/// The first such row that is no terminal.
+pub(super) fn fill_gaps(
+    next: &mut [f32],
+    observations: &[f32],
+    terminals: &[bool],
+    known: &mut Option<Vec<bool>>,
+) -> Result<usize, usize> {
+    let dim = next.len() / terminals.len().max(1);
+    let row = |i: usize| i * dim..(i + 1) * dim;
+    let gaps: Vec<usize> = (0..terminals.len()).filter(|&i| next[row(i)].iter().any(|x| !x.is_finite())).collect();
+    if let Some(&bad) = gaps.iter().find(|&&i| !terminals[i]) {
+        return Err(bad);
+    }
+    if !gaps.is_empty() {
+        let known = known.get_or_insert_with(|| vec![true; terminals.len()]);
+        for &i in &gaps {
+            known[i] = false;
+            next[row(i)].copy_from_slice(&observations[row(i)]);
+        }
+    }
+    Ok(gaps.len())
+}
+
+/// What the user is told of them.
+pub(super) fn told_gaps(name: &str, gaps: usize) -> Option<String> {
+    (gaps > 0).then(|| format!("`{name}` is not finite in {gaps} terminal rows, whose next state is taken as not known"))
+}
