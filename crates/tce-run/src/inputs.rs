@@ -72,6 +72,24 @@ impl Inputs {
         Self { agent, shift: None, target, source, extra, actions: None, limit }.checked(own)
     }
 
+    /// The same with rows in memory, which were checked when they were read ([`tce_data::load`], [`tce_data::from_columns`]). A number of
+    /// `origin` per row of `extra` tells which of them are target rows (0), as in a file of `tce augment`.
+    pub fn of_rows(
+        source: Option<Transitions>,
+        target: Transitions,
+        extra: Option<(Transitions, Option<&[f32]>)>,
+        own: &Own,
+    ) -> Result<Self> {
+        let (target, source) = (Table::in_memory(target, "target"), source.map(|rows| Table::in_memory(rows, "source")));
+        let besides = |(rows, origin): (Transitions, Option<&[f32]>)| {
+            let Table { rows, hash, complete, .. } = Table::in_memory(rows, "extra");
+            Table::without_target(complete.unwrap_or(rows), origin, Path::new("extra"), hash, &target)
+        };
+        let extra = extra.map(besides).transpose()?;
+        let (agent, limit) = (own.agent(), own.step_limit.map(|n| n as usize));
+        Self { agent, shift: None, target, source, extra, actions: None, limit }.checked(own)
+    }
+
     /// Finds the units of the files' actions, and brings all tables into the box.
     fn bring_into_the_box(&mut self, own: &Own) -> Result<()> {
         let tables = [Some(&self.target), self.source.as_ref(), self.extra.as_ref()];

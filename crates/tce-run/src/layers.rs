@@ -11,6 +11,7 @@ use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 use tce_base::FileError;
 use tce_data::{Agent, Quality, Shift, Task};
+use tce_learn::OtherRows;
 use toml::{Table, Value};
 
 use crate::config::{Algorithm, Config};
@@ -286,6 +287,17 @@ impl ConfigArgs {
     pub fn with_learner(mut self, learner: Option<Algorithm>) -> Self {
         self.sets.extend(learner.map(|l| format!("learner.algorithm={:?}", l.about().name)));
         self
+    }
+
+    /// The same for a training on tables of the user's own, by `learner` if one is given, with the share `top` of the best trajectories.
+    pub fn with_own_tables(self, learner: Option<Algorithm>, top: Option<f64>) -> Self {
+        let mut own = self.with_learner(learner);
+        own.sets.extend(top.map(|top| format!("learner.top={top:?}")));
+        if learner.is_some_and(|learner| learner.about().needs == OtherRows::Scored) {
+            // The rows are in the tables here; without scores of their own they are scored as source rows are.
+            own.sets.splice(0..0, ["mixture.generated=none".to_owned(), "mixture.source=all".to_owned()]);
+        }
+        own
     }
 
     /// Whether nothing was said.

@@ -1,5 +1,6 @@
 //! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
 
+pub mod augmentation;
 pub mod config;
 pub mod course;
 pub mod diagnosis;
@@ -24,6 +25,7 @@ pub mod sweep;
 pub mod tables;
 pub mod task_data;
 mod titles;
+pub mod training_run;
 pub mod variant;
 pub mod verdict;
 pub mod wrong_keys;

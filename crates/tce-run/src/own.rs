@@ -53,7 +53,11 @@ impl Own {
     }
 }
 
-fn parse_range(text: &str) -> Result<ActionRange, String> {
+/// LOW:HIGH for all columns, or one pair a column, separated by commas.
+///
+/// # Errors
+/// In words, if it is none.
+pub fn parse_range(text: &str) -> Result<ActionRange, String> {
     let mut range = ActionRange { low: Vec::new(), high: Vec::new() };
     for column in text.split(',') {
         let pair =

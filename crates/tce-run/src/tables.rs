@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use tce_base::sha256_file;
+use tce_base::{sha256_file, sha256_parts};
 use tce_data::{ActionRange, LoadOptions, Loaded, ReferenceScores, Standardizer, Transitions, load, main_file};
 
 use crate::error::{Error, Result};
@@ -45,6 +45,17 @@ pub struct Behaviour {
     pub score: Option<f64>,
 }
 
+/// SHA-256 of everything that rows in memory are.
+fn content_hash(rows: &Transitions) -> String {
+    let dims = [rows.obs_dim, rows.act_dim].iter().flat_map(|&dim| (dim as u64).to_le_bytes()).collect();
+    let numbers = [&rows.observations, &rows.actions, &rows.rewards, &rows.next_observations];
+    let numbers = numbers.into_iter().flat_map(|column| column.chunks(1 << 14));
+    let numbers = numbers.map(|part| part.iter().flat_map(|x| x.to_le_bytes()).collect());
+    let flags = [&rows.terminals, &rows.timeouts, &rows.known];
+    let flags = flags.into_iter().map(|column| column.iter().map(|&flag| u8::from(flag)).collect());
+    sha256_parts(std::iter::once(dims).chain(numbers).chain(flags))
+}
+
 impl Table {
     pub(crate) fn read(path: &Path, options: &LoadOptions) -> Result<Self> {
         let (loaded, hash) = Self::loaded(path, options)?;
@@ -63,33 +74,48 @@ impl Table {
     pub(crate) fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
         let options = LoadOptions { all_columns: true, ..options.clone() };
         let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
+        Self::without_target(transitions, columns.get("origin").map(Vec::as_slice), path, hash, target)
+    }
+
+    /// The rows that are not the target's: neither marked by `origin` as such, nor equal to one.
+    pub(crate) fn without_target(
+        rows: Transitions,
+        origin: Option<&[f32]>,
+        file: &Path,
+        hash: String,
+        target: &Self,
+    ) -> Result<Self> {
         let bits = |t: &Transitions, i: usize| -> Vec<u32> {
             let parts = [t.observation(i), t.action(i), t.next_observation(i)];
             parts.into_iter().flatten().map(|x| x.to_bits()).collect()
         };
         let own = target.complete();
         let known: HashSet<Vec<u32>> = (0..own.len()).map(|i| bits(own, i)).collect();
-        let origin = columns.get("origin");
-        let is_target =
-            |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&transitions, i).as_slice());
-        let others: Vec<usize> = (0..transitions.len()).filter(|&i| !is_target(i)).collect();
-        if others.len() == transitions.len() {
-            return Ok(Self::new(transitions, path, hash));
+        let is_target = |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&rows, i).as_slice());
+        let others: Vec<usize> = (0..rows.len()).filter(|&i| !is_target(i)).collect();
+        if others.len() == rows.len() {
+            return Ok(Self::new(rows, file, hash));
         }
         if others.is_empty() {
             return Err(Error::Usage(format!(
                 "{}: found the rows of {} alone, expected others; leave out --extra, or give a file with generated or source rows",
-                path.display(),
+                file.display(),
                 target.file.display()
             )));
         }
-        let left_out = transitions.len() - others.len();
+        let left_out = rows.len() - others.len();
         tce_base::note!(
             "{}: {left_out} of its {} rows are target rows and are left out, for --target brings them",
-            path.display(),
-            transitions.len()
+            file.display(),
+            rows.len()
         );
-        Ok(Self::new(transitions.select(&others), path, format!("{hash}, without {left_out} target rows")))
+        Ok(Self::new(rows.select(&others), file, format!("{hash}, without {left_out} target rows")))
+    }
+
+    /// Rows that are in memory; `name` stands for the file.
+    pub(crate) fn in_memory(rows: Transitions, name: &str) -> Self {
+        let hash = content_hash(&rows);
+        Self::new(rows, Path::new(name), hash)
     }
 
     pub(crate) fn new(rows: Transitions, file: &Path, hash: String) -> Self {

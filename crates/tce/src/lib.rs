@@ -4,6 +4,7 @@
 // An error ends the command: nobody waits for its copy.
 #![allow(clippy::result_large_err)]
 
+pub mod allocator;
 mod bench;
 mod commands;
 mod conclusion;

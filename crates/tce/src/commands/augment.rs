@@ -1,15 +1,13 @@
 //! `tce augment`.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_data::Transitions;
 use tce_nn::Device;
-use tce_run::course::Course;
+use tce_run::augmentation::Augmented;
 use tce_run::error::Result;
-use tce_run::expand::{Generated, expand};
+use tce_run::expand::Generated;
 use tce_run::inputs::Inputs;
 use tce_run::layers::ConfigArgs;
 use tce_run::own::{Own, Writing};
@@ -46,7 +44,7 @@ pub struct Augment {
 }
 
 #[derive(Serialize)]
-struct Augmented {
+struct Written {
     file: PathBuf,
     target_rows: usize,
     generated: Generated,
@@ -61,35 +59,15 @@ impl Augment {
         super::refuse::folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
-        let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
-        let mut course = Course::new(format!("{}x{}", dims.0, dims.1), 1, device, &self.cache);
-        course.generating(&config);
-        course.plan();
-        let expansion = expand(&inputs, &config, &[self.seed], &self.cache, device)?;
-        let report = expansion.reports[0].clone();
-        let (generated, target) = (&inputs.in_own_units(&expansion.tables[0]), &inputs.target_in_own_units());
-        let mut rows = Transitions::with_capacity(target.obs_dim, target.act_dim, target.len() + generated.len());
-        let mut origin = Vec::new();
-        if !self.only_generated {
-            rows.extend(target);
-            origin.resize(target.len(), 0.0);
-            // The last episode of the target must not run on into the generated rows.
-            if let (Some(timeout), Some(false)) = (rows.timeouts.last_mut(), target.terminals.last()) {
-                *timeout = true;
-            }
-        }
-        rows.extend(generated);
-        origin.resize(rows.len(), 1.0);
-        let attributes = BTreeMap::from([
-            ("source_sha256".to_owned(), inputs.source.as_ref().map_or_else(String::new, |s| s.hash.clone())),
-            ("target_sha256".to_owned(), inputs.target.hash.clone()),
-            ("seed".to_owned(), self.seed.to_string()),
-            ("config".to_owned(), config.to_toml()),
-            ("program".to_owned(), tce_base::PROGRAM.to_owned()),
-        ]);
-        self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &attributes, &[("origin", &origin)])?;
+        let augmented = Augmented::new(&inputs, &config, self.seed, &self.cache, device)?;
+        let target = &inputs.target_in_own_units();
+        let (rows, origin) = match self.only_generated {
+            true => (augmented.generated.clone(), vec![1.0; augmented.generated.len()]),
+            false => augmented.behind(target),
+        };
+        self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &augmented.attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };
-        output.print(&Augmented { file: self.out, target_rows: written, generated: report }, |a| {
+        output.print(&Written { file: self.out, target_rows: written, generated: augmented.report }, |a| {
             let g = &a.generated;
             let row = [
                 a.file.display().to_string(),

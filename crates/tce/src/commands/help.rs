@@ -6,7 +6,7 @@ use clap::Command;
 const GROUPS: [(&str, &[&str]); 6] = [
     ("The main job", &["run"]),
     ("Your own data", &["data", "augment", "learn", "judge"]),
-    ("Policies and their data", &["evaluate", "collect", "train-sac", "zoo"]),
+    ("Policies and their data", &["evaluate", "export", "collect", "train-sac", "zoo"]),
     ("Many runs", &["sweep", "report"]),
     ("Looking deeper", &["diagnose", "config", "bench"]),
     ("The program itself", &["completions", "man", "help"]),
@@ -35,6 +35,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("other settings", "tce run 'hopper-morph:medium->expert' --set generator.y_max=0.1"),
         ],
     ),
+    ("export", &[("a policy for ONNX runtimes", "tce export policy/policy.safetensors --onnx policy.onnx")]),
     (
         "augment",
         &[

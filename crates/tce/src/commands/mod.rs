@@ -1,5 +1,8 @@
 //! The command line: one file a command.
 
+use std::ffi::OsString;
+use std::sync::{Mutex, PoisonError};
+
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use tce_run::error::{Error, Result};
 use tce_run::processor::Processor;
@@ -14,6 +17,7 @@ mod config;
 mod data;
 mod diagnose;
 mod evaluate;
+mod export;
 mod help;
 mod judge;
 mod learn;
@@ -59,6 +63,8 @@ enum Command {
     Learn(learn::Learn),
     /// Try policies in the simulator: returns, scores, films.
     Evaluate(evaluate::Evaluate),
+    /// Write a policy as an ONNX model, for other programs.
+    Export(export::Export),
     /// Compare policies by the two data sets alone, in learned dynamics; no simulator needed.
     Judge(judge::JudgeArgs),
     /// Train actors by soft actor-critic in the simulator, for data of any quality.
@@ -97,12 +103,36 @@ impl Cli {
 
     /// What the user asked for. Help, versions and wrong calls end the process here, by clap's own hand: a wrong call with exit code 2.
     pub fn of_command_line() -> Self {
-        let matches = Self::described().get_matches();
-        Self::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+        Self::of(std::env::args_os()).unwrap_or_else(|e| e.exit())
+    }
+
+    /// The call `arguments`, the first of which is the program's name.
+    ///
+    /// # Errors
+    /// Help, versions and wrong calls.
+    pub fn of<T: Into<OsString> + Clone>(arguments: impl IntoIterator<Item = T>) -> Result<Self, clap::Error> {
+        Self::from_arg_matches(&Self::described().try_get_matches_from(arguments)?)
     }
 
     /// Runs the command.
+    ///
+    /// # Errors
+    /// Whatever it ends with.
     pub fn run(self) -> Result<()> {
+        self.run_into(None)
+    }
+
+    /// Runs the command, and returns its result as a JSON document in place of printing it.
+    ///
+    /// # Errors
+    /// Whatever it ends with.
+    pub fn json(self) -> Result<String> {
+        let result = Mutex::default();
+        Self { json: true, csv: false, ..self }.run_into(Some(&result))?;
+        Ok(result.into_inner().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn run_into(self, into: Option<&Mutex<String>>) -> Result<()> {
         if let Some(threads) = self.threads {
             if threads == 0 {
                 return Err(Error::Usage("--threads 0: expected at least 1".into()));
@@ -121,12 +151,13 @@ impl Cli {
             (false, true) => Form::Csv,
             _ => Form::Text,
         };
-        let output = Output { form };
+        let output = Output { form, into };
         match self.command {
             Command::Run(args) => args.run(output, &device()?),
             Command::Augment(args) => args.run(output, &device()?),
             Command::Learn(args) => args.run(output, &device()?),
             Command::Evaluate(args) => args.run(output),
+            Command::Export(args) => args.run(output),
             Command::Judge(args) => args.run(output, &device()?),
             Command::TrainSac(args) => args.run(output, &device()?),
             Command::Zoo(command) => command.run(output),

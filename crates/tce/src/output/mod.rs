@@ -1,6 +1,7 @@
 //! What a command prints: a table for people, JSON or CSV for programs.
 
 use std::io::IsTerminal;
+use std::sync::{Mutex, PoisonError};
 
 use serde::Serialize;
 
@@ -24,12 +25,14 @@ pub enum Form {
 
 /// Where and how results are printed. Progress and notes go to stderr, results to stdout.
 #[derive(Clone, Copy, Debug)]
-pub struct Output {
+pub struct Output<'a> {
     /// In which form.
     pub form: Form,
+    /// Where results go instead of stdout.
+    pub into: Option<&'a Mutex<String>>,
 }
 
-impl Output {
+impl Output<'_> {
     /// Prints `value` as JSON or CSV, or what `render` makes of it.
     pub fn print<T: Serialize>(&self, value: &T, render: impl FnOnce(&T) -> String) {
         use std::io::Write;
@@ -40,6 +43,10 @@ impl Output {
             Form::Csv => csv::of(&serde_json::to_string(value).expect("results are plain data")),
             Form::Text => fit(&render(value)),
         };
+        if let Some(into) = self.into {
+            into.lock().unwrap_or_else(PoisonError::into_inner).push_str(&text);
+            return;
+        }
         // A closed pipe (`tce ... | head`) is not an error of the command.
         let _ = writeln!(std::io::stdout(), "{}", text.trim_end());
     }

@@ -1,0 +1,249 @@
+//! A training run on a user's own tables: policies, a baseline beside them, and which one is recommended, in one directory.
+//!
+//! | file | content |
+//! |---|---|
+//! | `policy-seedN.safetensors` | the policies, one per seed |
+//! | `policy.safetensors` | the recommended one |
+//! | `verdict.json` | why it is recommended |
+//! | `floor/` | the clones of the target rows, where the policies learned from more than those |
+//! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | how it went, and what decided it |
+//!
+//! The same run in the same directory is taken from it, or resumed from its checkpoints.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use tce_base::{read_if_there, sha256_hex};
+use tce_data::ScoreTable;
+use tce_learn::OtherRows;
+use tce_nn::Device;
+use tce_zoo::actors::Arena;
+
+use crate::config::{Algorithm, Config, LearnerConfig};
+use crate::course::{Course, learning};
+use crate::error::{Error, Result};
+use crate::inputs::{Inputs, Table};
+use crate::judge::Judge;
+use crate::learning::{Learned, MemberData, learn, save_policies};
+use crate::methods::row_scores;
+use crate::own::Own;
+use crate::processor::Processor;
+use crate::verdict::{Candidate, Kept, keep, only, recommend};
+
+/// The name of the baseline: what stands beside policies that more than the target rows were used for.
+const BASELINE: &str = "cloning the target rows";
+
+/// Whether the policies are compared, with each other and with a baseline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Comparison {
+    /// Learn a baseline from the target rows alone, try all policies in learned dynamics, and recommend one.
+    Recommend,
+    /// Learn the policies, and no more.
+    Skip,
+}
+
+/// What a training run is told besides its tables.
+#[derive(Clone, Debug)]
+pub struct TrainingRun<'a> {
+    /// The settings.
+    pub config: &'a Config,
+    /// A policy for each.
+    pub seeds: &'a [u64],
+    /// What the user said of the tables.
+    pub own: &'a Own,
+    /// Whether a policy is recommended.
+    pub comparison: Comparison,
+    /// The directory of everything that is left behind.
+    pub out: &'a Path,
+}
+
+/// What a training run leaves behind: `summary.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Trained {
+    /// The policies' files, one per seed.
+    pub policies: Vec<PathBuf>,
+    /// The seeds.
+    pub seeds: Vec<u64>,
+    /// Training and evaluation.
+    #[serde(flatten)]
+    pub learned: Learned,
+    /// The recommendation, and the file `policy.safetensors` with the policy.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<Kept>,
+}
+
+/// Refuses options that `learner` has no use for, and a training without the `extra` rows that it needs.
+///
+/// # Errors
+/// Names the option.
+pub fn ensure_fits(learner: &LearnerConfig, extra: bool) -> Result<()> {
+    let method = learner.algorithm.about();
+    if learner.top < 1.0 && learner.algorithm != Algorithm::Bc {
+        return Err(Error::Usage(format!(
+            "learner.top: found {} with the learner {}, expected bc, whose option it is",
+            learner.top, method.name
+        )));
+    }
+    if !extra && method.needs == OtherRows::Source {
+        return Err(Error::Usage(format!(
+            "learner {}: found target rows alone, expected source rows as well; give them with --extra FILE (Python: extra=)",
+            method.name
+        )));
+    }
+    Ok(())
+}
+
+impl TrainingRun<'_> {
+    /// Trains the policies, or takes them from the directory if this run is done.
+    ///
+    /// # Errors
+    /// If the learner needs other rows than there are, the directory holds another run, training fails, or the user interrupts.
+    pub fn run(&self, inputs: &Inputs, device: &Device) -> Result<Trained> {
+        ensure_fits(&self.config.learner, inputs.extra.is_some())?;
+        inputs.ensure_episodes(&self.config.learner)?;
+        let (out, seeds) = (self.out, self.seeds);
+        let method = self.config.learner.algorithm.about();
+        let spec = self.spec(inputs, device);
+        let key = sha256_hex(spec.to_string().as_bytes());
+        if let Some(trained) = found(out, &spec)? {
+            tce_base::note!("done before, in {}", out.display());
+            return Ok(trained);
+        }
+        let data = self.members(inputs)?;
+        let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
+        tce_base::write_json(&out.join("spec.json"), &spec)?;
+        tce_base::write_atomically(&out.join("config.toml"), self.config.to_toml().as_bytes())?;
+        self.plan(inputs, device);
+        tce_base::begin_step(&learning(method.name));
+        let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
+        let mut policies = Vec::new();
+        let (learner, evaluation) = (&self.config.learner, &self.config.evaluation);
+        let learned = learn(data, learner, evaluation, arena, (out, &key), device, |trained| {
+            policies = save_policies(trained, seeds, out, inputs)?;
+            Ok(())
+        })?;
+        let verdict = match self.comparison {
+            Comparison::Skip => None,
+            Comparison::Recommend => {
+                let floor = inputs.extra.is_none();
+                let own = Candidate { name: method.name.into(), floor, files: policies.clone() };
+                let baseline = (!floor).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
+                Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
+            }
+        };
+        let trained = Trained { policies, seeds: seeds.to_vec(), learned, verdict };
+        tce_base::write_json(&out.join("summary.json"), &trained)?;
+        Ok(trained)
+    }
+
+    /// What every seed learns from.
+    fn members(&self, inputs: &Inputs) -> Result<Vec<MemberData>> {
+        // Who models the dynamics has no use for a terminal row without a successor.
+        let complete = !self.config.learner.algorithm.about().successors;
+        let target = match complete {
+            true => inputs.learned_from(&self.config.target),
+            false => inputs.imitated(&self.config.target),
+        };
+        let target = Arc::new(target.into_owned());
+        if let Some(choice) = inputs.choice(&self.config.target) {
+            tce_base::note!("{}", choice.reason);
+        }
+        let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
+        let extra = inputs.extra.as_ref().map(rows);
+        let row_scores = match &extra {
+            Some(extra) => row_scores(self.config, &target, extra)?,
+            None => None,
+        };
+        let member = |&seed: &u64| MemberData {
+            seed,
+            target: target.clone(),
+            extra: extra.clone(),
+            row_scores: row_scores.clone(),
+            trajectories: vec![target.clone()],
+        };
+        Ok(self.seeds.iter().map(member).collect())
+    }
+
+    /// What the target rows alone are good for: an ensemble of clones per seed, in `floor/`.
+    fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
+        let learner = self.baseline_learner();
+        let directory = self.out.join("floor");
+        tce_base::begin_step(&learning(BASELINE));
+        let mut files = Vec::new();
+        learn(data, &learner, &self.config.evaluation, None, (&directory, key), device, |policies| {
+            files = save_policies(policies, self.seeds, &directory, inputs)?;
+            Ok(())
+        })?;
+        Ok(Candidate { name: BASELINE.into(), floor: true, files })
+    }
+
+    fn baseline_learner(&self) -> LearnerConfig {
+        LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..self.config.learner.clone() }
+    }
+
+    fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
+        let judge = || Judge::train(inputs, &self.config.dynamics, self.out, device);
+        // Without a simulator a single policy is tried, too: nothing else tells what it is worth.
+        let alone = self.own.env.and_then(|_| only(&candidates));
+        let fitted_q = (self.config.fitted_q.steps > 0).then_some((&self.config.fitted_q, device));
+        keep(alone.map_or_else(|| recommend(judge, &candidates, fitted_q), Ok)?, self.out)
+    }
+
+    /// What decides the result.
+    fn spec(&self, inputs: &Inputs, device: &Device) -> serde_json::Value {
+        let mut spec = serde_json::json!({
+            "program": env!("CARGO_PKG_VERSION"), "config": self.config, "seeds": self.seeds, "own": self.own,
+            "actions": &inputs.actions, "target": &inputs.target.hash, "extra": inputs.extra.as_ref().map(|t| &t.hash),
+        });
+        if let Some(source) = &inputs.source {
+            spec["source"] = source.hash.clone().into();
+        }
+        Processor::from(device).sign(&mut spec);
+        spec
+    }
+
+    /// Tells the steps that are to come.
+    fn plan(&self, inputs: &Inputs, device: &Device) {
+        let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
+        let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
+        let mixed = inputs.extra.is_some();
+        course.learning(config.learner.algorithm.about().name, config, mixed);
+        if self.comparison == Comparison::Recommend {
+            if mixed {
+                course.learning(BASELINE, &Config { learner: self.baseline_learner(), ..config.clone() }, false);
+            }
+            course.verdict(config);
+            course.fitted_q(config, seeds * if mixed { 2 } else { 1 });
+        }
+        course.plan();
+    }
+}
+
+/// What a training of `spec` left in `out`, if it came to its end; None where it is to begin or to go on.
+///
+/// # Errors
+/// If another training's results, or what it left when it was interrupted, are there.
+fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
+    let (spec_file, summary_file) = (out.join("spec.json"), out.join("summary.json"));
+    let summary = read_if_there(&summary_file)?;
+    let same = match read_if_there(&spec_file)? {
+        Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| found == *spec),
+        None => summary.is_none(),
+    };
+    if !same {
+        let end = if summary.is_some() { "the results of" } else { "an interrupted" };
+        return Err(Error::Usage(format!(
+            "{}: found {end} learning with other settings, seeds or files; choose another --out{}",
+            out.display(),
+            if summary.is_some() { " (tce evaluate judges a policy that is there)" } else { ", or remove it" }
+        )));
+    }
+    let Some(bytes) = summary else { return Ok(None) };
+    let trained = serde_json::from_slice::<Trained>(&bytes);
+    match trained.map(|r| (r.policies.iter().all(|p| p.exists()), r)) {
+        Ok((true, trained)) => Ok(Some(trained)),
+        // Its policies were removed or moved: they are learned again.
+        _ => Ok(None),
+    }
+}
