@@ -37,7 +37,7 @@ use crate::models::{context_encoder, contexts, networks};
 pub use crate::models::{
     critic, cvae, dynamics, fitted_q, labels, pair_model, transformer, transition_model, world_model,
 };
-pub use crate::policies::{actor, import};
+pub use crate::policies::{actor, import, onnx};
 use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};

@@ -4,5 +4,6 @@ pub mod actor;
 pub mod import;
 pub(crate) mod mlp_policy;
 pub(crate) mod npy;
+pub mod onnx;
 pub(crate) mod policy;
 pub(crate) mod sequence_policy;

@@ -1,0 +1,228 @@
+//! A table of transitions whose columns NumPy sees without a copy.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::ValueEnum;
+use numpy::ndarray::{ArrayView1, ArrayView2};
+use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use tce_data::{Columns, LoadOptions, Loaded, Transitions, from_columns};
+use tce_run::own::{DataFormat, Writing};
+
+use crate::errors::{Raise, exception};
+use crate::settings::Robot;
+
+/// Rows (s, a, r, s', terminal, time-out) and what reading them found.
+#[pyclass(frozen, module = "tce._tce")]
+pub struct Table {
+    pub rows: Arc<Transitions>,
+    columns: BTreeMap<String, Vec<f32>>,
+    report: Option<String>,
+}
+
+impl Table {
+    /// Rows that the program made.
+    pub fn of(rows: Transitions) -> Self {
+        Self { rows: Arc::new(rows), columns: BTreeMap::new(), report: None }
+    }
+
+    fn loaded(loaded: Loaded) -> Self {
+        let report = serde_json::to_string(&loaded.report).ok();
+        Self { rows: Arc::new(loaded.transitions), columns: loaded.columns, report }
+    }
+
+    /// The further column `name`, if there is one.
+    pub fn column_of(&self, name: &str) -> Option<&[f32]> {
+        self.columns.get(name).map(Vec::as_slice)
+    }
+}
+
+/// A read-only view of `values`, which `owner` keeps.
+fn vector<'py, T: Element>(owner: &Bound<'py, Table>, values: &[T]) -> Bound<'py, PyAny> {
+    // SAFETY: the table is frozen: its memory stays where it is for as long as it is alive, and the array keeps it alive.
+    let array = unsafe { PyArray1::borrow_from_array(&ArrayView1::from(values), owner.clone().into_any()) };
+    array.readwrite().make_nonwriteable();
+    array.into_any()
+}
+
+/// The same with `dim` columns.
+fn matrix<'py>(owner: &Bound<'py, Table>, values: &[f32], dim: usize) -> Bound<'py, PyAny> {
+    let view = ArrayView2::from_shape((values.len() / dim.max(1), dim), values).expect("whole rows");
+    // SAFETY: as above.
+    let array = unsafe { PyArray2::borrow_from_array(&view, owner.clone().into_any()) };
+    array.readwrite().make_nonwriteable();
+    array.into_any()
+}
+
+fn copied<T: Element + Copy>(array: &PyReadonlyArray1<'_, T>) -> Vec<T> {
+    array.as_array().iter().copied().collect()
+}
+
+#[pymethods]
+impl Table {
+    /// Reads a file in any layout that the program knows, with all its further columns.
+    #[staticmethod]
+    fn load(py: Python<'_>, path: PathBuf, robot: Robot) -> PyResult<Self> {
+        let own = robot.own().or_raise(py)?;
+        let options = LoadOptions { all_columns: true, ..own.load_options() };
+        py.detach(|| tce_data::load(&path, &options)).map(Self::loaded).or_raise(py)
+    }
+
+    /// Checks arrays as a file with the same columns is checked.
+    #[staticmethod]
+    #[expect(clippy::too_many_arguments, reason = "a column each")]
+    fn of_arrays(
+        py: Python<'_>,
+        name: PathBuf,
+        observations: PyReadonlyArray2<'_, f32>,
+        actions: PyReadonlyArray2<'_, f32>,
+        rewards: PyReadonlyArray1<'_, f32>,
+        next_observations: Option<PyReadonlyArray2<'_, f32>>,
+        terminals: PyReadonlyArray1<'_, bool>,
+        timeouts: Option<PyReadonlyArray1<'_, bool>>,
+        further: BTreeMap<String, PyReadonlyArray1<'_, f32>>,
+        robot: Robot,
+    ) -> PyResult<Self> {
+        let flat = |array: &PyReadonlyArray2<'_, f32>| -> Vec<f32> {
+            array.as_slice().map_or_else(|_| array.as_array().iter().copied().collect(), <[f32]>::to_vec)
+        };
+        if let Some(next) = next_observations.as_ref().filter(|next| next.shape()[1] != observations.shape()[1]) {
+            let (found, expected) = (next.shape()[1], observations.shape()[1]);
+            let message = format!(
+                "{}: field `next_observations`: found {found} columns; expected {expected} columns, as in `observations`",
+                name.display()
+            );
+            return Err(exception(py, "DataError", message));
+        }
+        let columns = Columns {
+            obs_dim: observations.shape()[1],
+            act_dim: actions.shape()[1],
+            observations: flat(&observations),
+            actions: flat(&actions),
+            rewards: copied(&rewards),
+            next_observations: next_observations.as_ref().map(flat),
+            terminals: copied(&terminals),
+            timeouts: timeouts.as_ref().map(copied),
+            further: further.iter().map(|(name, column)| (name.clone(), copied(column))).collect(),
+        };
+        let options = robot.own().or_raise(py)?.load_options();
+        py.detach(|| from_columns(columns, &name, &options)).map(Self::loaded).or_raise(py)
+    }
+
+    /// Rows as another process had them, which were checked there.
+    #[staticmethod]
+    fn of_state(
+        observations: PyReadonlyArray2<'_, f32>,
+        actions: PyReadonlyArray2<'_, f32>,
+        rewards: PyReadonlyArray1<'_, f32>,
+        next_observations: PyReadonlyArray2<'_, f32>,
+        flags: [PyReadonlyArray1<'_, bool>; 3],
+        further: BTreeMap<String, PyReadonlyArray1<'_, f32>>,
+        report: Option<String>,
+    ) -> Self {
+        let [terminals, timeouts, known] = flags.map(|array| copied(&array));
+        let rows = Transitions {
+            obs_dim: observations.shape()[1],
+            act_dim: actions.shape()[1],
+            observations: observations.as_array().iter().copied().collect(),
+            actions: actions.as_array().iter().copied().collect(),
+            rewards: copied(&rewards),
+            next_observations: next_observations.as_array().iter().copied().collect(),
+            terminals,
+            timeouts,
+            known,
+        };
+        let columns = further.iter().map(|(name, column)| (name.clone(), copied(column))).collect();
+        Self { rows: Arc::new(rows), columns, report }
+    }
+
+    fn __len__(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// State and action dimension.
+    #[getter]
+    fn dims(&self) -> (usize, usize) {
+        (self.rows.obs_dim, self.rows.act_dim)
+    }
+
+    /// What reading found, as JSON; None for rows that the program made.
+    #[getter]
+    fn report(&self) -> Option<&str> {
+        self.report.as_deref()
+    }
+
+    /// All columns by their names, as read-only views.
+    fn columns<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
+        let (table, columns) = (this.get(), PyDict::new(this.py()));
+        let t = &table.rows;
+        columns.set_item("observations", matrix(this, &t.observations, t.obs_dim))?;
+        columns.set_item("actions", matrix(this, &t.actions, t.act_dim))?;
+        columns.set_item("rewards", vector(this, &t.rewards))?;
+        columns.set_item("next_observations", matrix(this, &t.next_observations, t.obs_dim))?;
+        columns.set_item("terminals", vector(this, &t.terminals))?;
+        columns.set_item("timeouts", vector(this, &t.timeouts))?;
+        columns.set_item("known", vector(this, &t.known))?;
+        for (name, values) in &table.columns {
+            columns.set_item(name, vector(this, values))?;
+        }
+        Ok(columns)
+    }
+
+    /// First row, row after the last one, and return of every episode.
+    fn episodes(&self) -> Vec<(usize, usize, f64)> {
+        self.rows.episodes().iter().map(|e| (e.start, e.end, e.episode_return)).collect()
+    }
+
+    /// The rows at `indices`; an episode ends where its next row is not taken.
+    fn select(&self, py: Python<'_>, indices: Vec<usize>) -> PyResult<Self> {
+        if let Some(bad) = indices.iter().find(|&&i| i >= self.rows.len()) {
+            let words = format!("row {bad}: the table has {}", self.rows.len());
+            return Err(pyo3::exceptions::PyIndexError::new_err(words));
+        }
+        let pick = |values: &Vec<f32>| indices.iter().map(|&i| values[i]).collect();
+        let columns = self.columns.iter().map(|(name, values)| (name.clone(), pick(values))).collect();
+        let rows = py.detach(|| Arc::new(self.rows.select(&indices)));
+        Ok(Self { rows, columns, report: None })
+    }
+
+    /// What `tce data check` notices, as JSON.
+    fn check(&self, py: Python<'_>, robot: Robot) -> PyResult<String> {
+        let agent = robot.own().or_raise(py)?.agent();
+        let check = py.detach(|| tce_data::check(&self.rows, agent));
+        Ok(serde_json::to_string(&check).expect("plain data"))
+    }
+
+    /// What `tce data inspect` tells, as JSON.
+    fn inspect(&self, py: Python<'_>, robot: Robot) -> PyResult<String> {
+        let limit = robot.own().or_raise(py)?.limit();
+        let inspection = py.detach(|| tce_data::inspect(&self.rows, limit));
+        Ok(serde_json::to_string(&inspection).expect("plain data"))
+    }
+
+    /// Writes the rows, whole or not at all.
+    fn save(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        format: &str,
+        id: Option<String>,
+        overwrite: bool,
+        attributes: BTreeMap<String, String>,
+    ) -> PyResult<()> {
+        let format = DataFormat::from_str(format, false).map_err(|_| {
+            let words = format!("format: found {format:?}, expected \"d4rl\" or \"minari\"");
+            exception(py, "ConfigError", words)
+        })?;
+        if path.exists() && !overwrite {
+            let words = format!("{} exists; choose another name, or say overwrite=True", path.display());
+            return Err(pyo3::exceptions::PyFileExistsError::new_err(words));
+        }
+        let columns: Vec<(&str, &[f32])> = self.columns.iter().map(|(k, v)| (k.as_str(), v.as_slice())).collect();
+        let writing = Writing { format, id, force: overwrite };
+        py.detach(|| writing.write(&path, &self.rows, None, &attributes, &columns)).or_raise(py)
+    }
+}

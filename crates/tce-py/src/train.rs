@@ -1,0 +1,57 @@
+//! Policies from tables.
+
+use std::path::PathBuf;
+
+use pyo3::prelude::*;
+use tce_run::inputs::Inputs;
+use tce_run::pipeline::seeds as counted;
+use tce_run::training_run::{Comparison, TrainingRun, ensure_fits};
+
+use crate::augment::taken;
+use crate::errors::Raise;
+use crate::settings::{Robot, Settings};
+use crate::table::Table;
+use crate::work::{Progress, attended};
+
+/// Which policies to train.
+#[derive(FromPyObject)]
+pub struct Wanted {
+    learner: Option<String>,
+    top: Option<f64>,
+    seeds: usize,
+    first_seed: u64,
+    compare: bool,
+}
+
+/// Trains policies on `target`, and `extra` rows if there are any, into the folder `out`. The summary as JSON.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "as the command has options")]
+pub fn train(
+    py: Python<'_>,
+    target: &Table,
+    extra: Option<PyRef<'_, Table>>,
+    source: Option<PyRef<'_, Table>>,
+    wanted: Wanted,
+    settings: Settings,
+    robot: Robot,
+    out: PathBuf,
+    progress: Progress,
+) -> PyResult<String> {
+    let config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
+    let own = robot.own().or_raise(py)?;
+    let seeds = counted(wanted.first_seed, wanted.seeds).or_raise(py)?;
+    ensure_fits(&config.learner, extra.is_some()).or_raise(py)?;
+    let comparison = if wanted.compare { Comparison::Recommend } else { Comparison::Skip };
+    let target = target.rows.clone();
+    let source = source.filter(|_| wanted.compare).map(|table| table.rows.clone());
+    let extra = extra.map(|table| (table.rows.clone(), table.column_of("origin").map(<[f32]>::to_vec)));
+    let trained = attended(py, progress, move || {
+        tce_base::ensure_folder(&out)?;
+        let extra = extra.as_ref().map(|(rows, origin)| (taken(rows), origin.as_deref()));
+        let inputs = Inputs::of_rows(source.as_ref().map(taken), taken(&target), extra, &own)?;
+        let inputs = inputs.with_target_rows(config.target.rows);
+        let run = TrainingRun { config: &config, seeds: &seeds, own: &own, comparison, out: &out };
+        run.run(&inputs, &tce_nn::cpu())
+    })?;
+    Ok(serde_json::to_string(&trained).expect("plain data"))
+}

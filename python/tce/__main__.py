@@ -1,0 +1,5 @@
+"""``python -m tce``."""
+
+from ._cli import main
+
+main()

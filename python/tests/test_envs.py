@@ -1,0 +1,87 @@
+"""Environments and the evaluation of policies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tce
+
+gymnasium = pytest.importorskip("gymnasium")
+
+
+@pytest.fixture(scope="module")
+def arm_policy():
+    return lambda observation: np.clip(-0.5 * observation[4:6], -1, 1)
+
+
+def simulated(name: str = "hopper-morph"):
+    try:
+        return tce.make(name)
+    except tce.Error as error:
+        pytest.skip(f"no simulator: {error}")
+
+
+@pytest.mark.parametrize("name", ["hopper-morph", "ant-gravity5", "halfcheetah-source", "walker2d-kinematic"])
+def test_robots_are_environments(name):
+    from gymnasium.utils.env_checker import check_env
+
+    simulated(name)
+    env = gymnasium.make(f"tce/{name}-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_episodes_repeat_by_their_seed():
+    env = simulated()
+    runs = []
+    for _ in range(2):
+        observation, _ = env.reset(seed=3)
+        steps = [observation]
+        for action in np.linspace(-1, 1, 30).reshape(10, 3):
+            steps.append(env.step(action)[0])
+        runs.append(np.stack(steps))
+    np.testing.assert_array_equal(*runs)
+    assert not np.array_equal(env.reset()[0], env.reset()[0])
+
+
+def test_the_program_and_gymnasium_agree():
+    env = simulated()
+    policy = tce.Policy.load("zoo:hopper-morph-expert")
+    inside = tce.evaluate(policy, "hopper-morph", episodes=5, seed=1)
+    outside = tce.evaluate(policy, env, episodes=5, seed=1)
+    assert inside.score > 80 and abs(inside.mean - outside.mean) < 0.1 * inside.mean, (inside, outside)
+
+
+def test_vector_environments_count_whole_episodes():
+    import arm
+
+    def policy(observation):
+        return np.clip(-0.3 * observation[4:6], -1, 1)
+
+    single = tce.evaluate(policy, arm.Arm(), episodes=6, seed=0)
+    assert list(single.lengths) == [arm.STEPS] * 6
+    for mode in gymnasium.vector.AutoresetMode:
+        if mode.name == "DISABLED":
+            continue
+        lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 3, autoreset_mode=mode)
+        found = tce.evaluate(policy, lanes, episodes=6, seed=0)
+        assert list(found.lengths) == [arm.STEPS] * 6, mode
+        assert abs(found.mean - single.mean) < 25, (mode, found, single)
+
+
+def test_a_trained_policy_in_an_own_environment():
+    import arm
+    from conftest import TINY
+
+    data = tce.load(arm.log(load=0.2, episodes=4, skill=1.0, seed=0), step_limit=arm.STEPS)
+    policy = tce.train(data, config=TINY, compare=False).policy
+    lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 2)
+    assert len(tce.evaluate(policy, lanes, episodes=4).returns) == 4
+    assert len(tce.evaluate(policy, arm.Arm(), episodes=2).returns) == 2
+
+
+def test_wrong_calls():
+    with pytest.raises(tce.ConfigError, match="at least 1"):
+        tce.evaluate(lambda o: o, "hopper-morph", episodes=0)
+    simulated()
+    with pytest.raises(tce.ConfigError, match="hopper"):
+        tce.make("hoper-morph")
