@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union
 
+import numpy as np
+
 from .errors import ConfigError
 
 #: A mapping of changed keys (nested, or dotted as in ``{"learner.steps": 1000}``), or a TOML file of them.
@@ -49,8 +51,8 @@ class Robot:
 def _range(given: ActionRange) -> str | None:
     if given is None:
         return None
-    pairs = [given] if len(given) == 2 and not isinstance(given[0], (tuple, list)) else given
-    return ",".join(f"{float(low)}:{float(high)}" for low, high in pairs)  # type: ignore[misc]
+    flat = np.asarray(given, dtype=float).reshape(-1, 2)
+    return ",".join(f"{low!r}:{high!r}" for low, high in flat.tolist())
 
 
 def _flat(config: Mapping[str, Any], prefix: str) -> list[tuple[str, Any]]:

@@ -23,7 +23,7 @@ def module(policy: Policy) -> Any:
     spec = metadata["policy"]
     activations = {"identity": nn.Identity, "relu": nn.ReLU, "silu": nn.SiLU, "tanh": nn.Tanh}
 
-    class PolicyModule(nn.Module):
+    class PolicyModule(nn.Module):  # type: ignore[misc, unused-ignore]
         """Standardise, clip, perceptron, head, units."""
 
         def __init__(self) -> None:

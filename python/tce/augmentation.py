@@ -60,17 +60,20 @@ class Augmented:
 
     def transitions(self) -> Transitions:
         """Target rows, then generated ones; ``extra_columns["origin"]`` is 0 and 1."""
-        parts = (self.target, self.generated)
-        columns = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("observations", "actions", "rewards", "next_observations", "terminals", "timeouts", "known")
-        }
+        target, generated = self.target, self.generated
+
+        def joined(name: str) -> npt.NDArray[Any]:
+            return np.concatenate([getattr(target, name), getattr(generated, name)])
+
+        terminals, timeouts, known = (joined(name) for name in ("terminals", "timeouts", "known"))
         # The last episode of the target must not run on into the generated rows.
-        end = len(self.target) - 1
-        if end >= 0 and not columns["terminals"][end]:
-            columns["timeouts"][end] = True
-        flags = [columns.pop(name) for name in ("terminals", "timeouts", "known")]
-        return Transitions(_tce.Table.of_state(*columns.values(), flags, {"origin": self.origin()}, None))
+        end = len(target) - 1
+        timeouts[end] |= not terminals[end]
+        columns = (joined(name) for name in ("observations", "actions", "rewards", "next_observations"))
+        observations, actions, rewards, following = columns
+        flags = [terminals, timeouts, known]
+        further = {"origin": self.origin()}
+        return Transitions(_tce.Table.of_state(observations, actions, rewards, following, flags, further, None))
 
     def origin(self) -> npt.NDArray[np.float32]:
         """0 for each target row, then 1 for each generated one."""

@@ -124,11 +124,13 @@ class Transitions:
         env : str, optional
             The benchmark's robot and shift, as in ``"hopper-morph"``, whose dimensions and ranges the data must have.
         """
-        return json.loads(self._table.check(Robot(env)))["findings"]
+        found: dict[str, list[dict[str, str]]] = json.loads(self._table.check(Robot(env)))
+        return found["findings"]
 
     def describe(self, env: str | None = None, step_limit: int | None = None) -> dict[str, Any]:
         """Rows, episodes, returns, ranges and constant dimensions, as ``tce data inspect --json`` tells them."""
-        return json.loads(self._table.inspect(Robot(env, step_limit)))
+        found: dict[str, Any] = json.loads(self._table.inspect(Robot(env, step_limit)))
+        return found
 
     def to_dict(self) -> dict[str, npt.NDArray[Any]]:
         """All columns by D4RL's names; further ones behind them. The arrays are views."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tce
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "examples"))
+# Processes that tests start find the package where these tests found it.
+os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(tce.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
 
 #: Settings with which everything takes seconds.
 TINY: dict[str, Any] = {
@@ -18,7 +22,7 @@ TINY: dict[str, Any] = {
     "labels.training.steps": 30,
     "dynamics": {"steps": 30, "members": 1},
     "fitted_q.steps": 20,
-    "learner": {"steps": 40, "bc": {"ensemble": 1}, "batch": 32},
+    "learner": {"steps": 40, "bc": {"ensemble": 1}, "batch": 32, "meta_dt.world_model.steps": 5},
 }
 
 

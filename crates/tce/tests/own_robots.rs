@@ -370,3 +370,29 @@ fn a_sweeps_folder_is_its_own() {
     assert!(!lacking.status.success() && message(&lacking).contains("gone.hdf5"), "{}", message(&lacking));
     assert!(!dir.join("t").exists());
 }
+
+/// Two behaviours in one file: the better trajectories are imitated, as `tce run` does.
+#[test]
+fn the_better_of_two_behaviours_is_learned() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let better = arm(4, 2, (4, 400), 1.0, 1);
+    let mut worse = arm(4, 2, (4, 400), 1.0, 2);
+    worse.rewards.iter_mut().for_each(|r| *r -= 5.0);
+    let mut mixed = worse;
+    mixed.extend(&better);
+    save(dir, "better.hdf5", &better);
+    save(dir, "mixed.hdf5", &mixed);
+    let policy = |target: &str, out: &str, more: &[&str]| {
+        let args = ["learn", "--target", target, "--out", out, "--no-verdict"];
+        let output = tce(dir, &[&args, TINY, more].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        (std::fs::read(dir.join(out).join("policy-seed0.safetensors")).unwrap(), message(&output))
+    };
+    let (of_better, _) = policy("better.hdf5", "better", &[]);
+    let (of_mixed, told) = policy("mixed.hdf5", "mixed", &[]);
+    assert!(told.contains("learned from the better four (1600 of 3200 rows)"), "{told}");
+    assert_eq!(of_mixed, of_better);
+    let (of_all, _) = policy("mixed.hdf5", "all", &["--set", "target.trajectories=all"]);
+    assert_ne!(of_all, of_better);
+}
