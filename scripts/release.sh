@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes dist/tce-VERSION-linux-ARCH.tar.gz, with its SHA-256 beside it: scripts/release.sh [x86_64|aarch64]
+# Makes dist/tce-VERSION-linux-ARCH.tar.gz, with its SHA-256 beside it, and the wheel of the Python package: scripts/release.sh [x86_64|aarch64]
 # The default is this machine's architecture; the other one takes a target (rustup target add aarch64-unknown-linux-gnu) and a
 # linker (CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc, and CC_aarch64_unknown_linux_gnu likewise).
 # The program needs a glibc as new as this machine's allows it to: build on the oldest system that shall run it.
@@ -73,3 +73,12 @@ tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$(git log -1 --for
 glibc=$(objdump -T "$work/$name/bin/tce" | grep -o 'GLIBC_[0-9.]*' | sort -Vu | tail -n 1)
 mv -f "$work/$name.tar.gz.sha256" "$work/$name.tar.gz" dist/
 echo "dist/$name.tar.gz: $(du -h "dist/$name.tar.gz" | cut -f 1), needs ${glibc/_/ } or newer"
+
+# The wheel of the Python package, for all versions from 3.10 on. It carries neither Rust nor MuJoCo.
+if [ "$arch" = "$here" ]; then
+  python3 -m pip --disable-pip-version-check install --quiet --upgrade --target "$work/maturin" 'maturin>=1.9.4,<2'
+  PYTHONPATH="$work/maturin" python3 -m maturin build --release --locked --quiet --out dist
+  ls dist/tce-*.whl
+else
+  echo "warning: the wheel is left out: maturin builds it on a machine of its architecture" >&2
+fi

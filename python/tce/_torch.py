@@ -51,11 +51,13 @@ def module(policy: Policy) -> Any:
             self.network = nn.Sequential(*layers)
 
         def forward(self, observation: Any) -> Any:
+            low: Any = self.low
+            high: Any = self.high
             x = (observation[:, self.inputs] - self.mean) / self.std
             if self.clip is not None:
                 x = x.clamp(-self.clip, self.clip)
             out = self.network(x)
             action = torch.tanh(out[:, : policy.action_size]) if self.squashed else out.clamp(-1.0, 1.0)
-            return self.low + (action + 1.0) * 0.5 * (self.high - self.low)
+            return low + (action + 1.0) * 0.5 * (high - low)
 
     return PolicyModule().eval()

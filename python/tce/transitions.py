@@ -187,11 +187,13 @@ class Transitions:
         import minari
         from minari.data_collector import EpisodeBuffer
 
+        # The buffers take arrays, whatever their annotations say.
+        buffer: Any = EpisodeBuffer
         buffers = []
         for k, e in enumerate(self.episodes()):
             states = np.concatenate([self.observations[e.rows], self.next_observations[e.stop - 1 : e.stop]])
             buffers.append(
-                EpisodeBuffer(
+                buffer(
                     id=k,
                     observations=states,
                     actions=self.actions[e.rows],
@@ -288,13 +290,15 @@ def load(
         source = minari.load_dataset(source.removeprefix("minari:"))
     if isinstance(source, (str, os.PathLike)):
         return Transitions(_tce.Table.load(Path(source), robot))
-    h5py = sys.modules.get("h5py")
+    h5py: Any = sys.modules.get("h5py")
     if h5py is not None and isinstance(source, h5py.Group):
-        filename = source.file.filename
-        if source.name == "/" and os.path.exists(filename):
-            source.file.flush() if source.file.mode != "r" else None
+        group: Any = source
+        filename = group.file.filename
+        if group.name == "/" and os.path.exists(filename):
+            if group.file.mode != "r":
+                group.file.flush()
             return Transitions(_tce.Table.load(Path(filename), robot))
-        source = {key: value[()] for key, value in source.items() if hasattr(value, "shape")}
+        source = {key: value[()] for key, value in group.items() if hasattr(value, "shape")}
     path = getattr(getattr(source, "storage", None), "data_path", None)
     if path is not None:
         # Minari keeps its own files: they are read as they are, with all dtypes and spaces.
