@@ -1,4 +1,6 @@
-"""A robot of one's own: many rows of the old arm, few of the changed one, a policy for the changed one. About ten minutes on two cores.
+"""A robot of one's own: many rows of the old arm, few of the changed one, a policy for the changed one.
+
+About an hour on two cores; with --quick about ten minutes.
 
 The hand of the arm (arm.py) carries 0.2 kg; then it carries 1.5 kg. 40 logged episodes of the changed arm are all there is.
 
@@ -41,5 +43,5 @@ def main(quick: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the quick preset and fewer rows: a minute or two")
+    parser.add_argument("--quick", action="store_true", help="the quick preset and fewer rows")
     main(parser.parse_args().quick)

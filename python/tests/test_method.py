@@ -164,6 +164,24 @@ def test_python_runs_on_while_the_program_works(target):
     assert counted[0] > 20, "the lock of Python was released"
 
 
+def test_a_fork_is_refused_instead_of_waiting_for_ever():
+    script = "import tce, conftest, multiprocessing as m; d = conftest.walk(0.2, 12, 2); c = dict(config=conftest.TINY, compare=False)"
+    script += """
+def work(queue):
+    try:
+        tce.train(d, **c)
+    except tce.Error as error:
+        queue.put(str(error))
+tce.train(d, **c)
+fork = m.get_context("fork")
+queue = fork.Queue()
+fork.Process(target=work, args=(queue,)).start()
+print(queue.get(timeout=60))
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=120)
+    assert 'get_context("spawn")' in done.stdout, done.stderr
+
+
 def test_calls_in_threads_take_turns(target):
     results = [None, None]
 

@@ -2,8 +2,8 @@
 
 use std::any::Any;
 use std::sync::mpsc::{Receiver, channel};
-use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
-use std::thread;
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
+use std::{process, thread};
 use std::time::Duration;
 
 use pyo3::prelude::*;
@@ -23,6 +23,22 @@ static TURN: Mutex<()> = Mutex::new(());
 /// seconds, for every piece of work under way.
 #[derive(FromPyObject)]
 pub struct Progress(bool, Option<Py<PyAny>>);
+
+/// The process whose threads compute. A fork of it has none of them, and would wait for them for ever.
+static OWNER: OnceLock<u32> = OnceLock::new();
+
+/// Refuses to work in a fork of a process that has worked.
+fn ensure_not_forked(py: Python<'_>) -> PyResult<()> {
+    let (owner, own) = (*OWNER.get_or_init(process::id), process::id());
+    if owner == own {
+        return Ok(());
+    }
+    let words = format!(
+        "found a process ({own}) that was forked from one that had computed ({owner}), expected one of its own: the threads were not copied. \
+         Use multiprocessing.get_context(\"spawn\"), or fork before the first call"
+    );
+    Err(exception(py, "Error", words))
+}
 
 enum Message {
     Note(String),
@@ -50,6 +66,7 @@ pub fn attended<T: Send>(
     progress: Progress,
     work: impl FnOnce() -> Result<T, Error> + Send,
 ) -> PyResult<T> {
+    ensure_not_forked(py)?;
     let _turn = turn(py)?;
     let (sender, messages) = channel();
     let notes = Mutex::new(sender.clone());
