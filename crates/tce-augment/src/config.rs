@@ -262,26 +262,26 @@ pub enum Terminal {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SingleStageConfig {
-    /// The noise process of the joint network, chosen by its `kind`.
+    /// The noise process of the single-stage network, chosen by its `kind`.
     pub process: Process,
-    /// How rows are drawn from the joint network, chosen by its `kind`.
+    /// How rows are drawn from the single-stage network, chosen by its `kind`.
     pub sampler: Sampler,
     /// What stands in a generated row for s': s' itself, or its difference from s. Source: SynthER and DmC have the next state.
     pub target: Target,
-    /// Width of the joint network's layers. Source: SynthER, DmC: 2048.
+    /// Width of the single-stage network's layers. Source: SynthER, DmC: 2048.
     #[schemars(range(min = 1))]
     pub width: usize,
     /// Width of the embedding of the noise level.
     #[schemars(range(min = 1))]
     pub embedding: usize,
-    /// Residual blocks of the joint network. Source: SynthER, DmC: 6.
+    /// Residual blocks of the single-stage network. Source: SynthER, DmC: 6.
     pub blocks: usize,
-    /// Training steps of the joint network. Source: SynthER, DmC: 100 000.
+    /// Training steps of the single-stage network. Source: SynthER, DmC: 100 000.
     pub steps: u64,
-    /// Rows per step of the joint network. Source: SynthER, DmC: 1024, 256 for small data.
+    /// Rows per step of the single-stage network. Source: SynthER, DmC: 1024, 256 for small data.
     #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Learning rate of the joint network at the beginning. Source: SynthER, DmC: 3e-4.
+    /// Learning rate of the single-stage network at the beginning. Source: SynthER, DmC: 3e-4.
     pub learning_rate: f64,
     /// The learning rate over the steps.
     pub schedule: Schedule,

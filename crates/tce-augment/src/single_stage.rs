@@ -261,7 +261,7 @@ impl SingleStage {
             let (rows, kept, outside_box) = units.decode(rows);
             if rows.is_empty() {
                 return Err(Error::Failed(format!(
-                    "seed {}: none of {n} generated rows is finite; lower joint.learning_rate, or look for huge values in the data",
+                    "seed {}: none of {n} generated rows is finite; lower single_stage.learning_rate, or look for huge values in the data",
                     work.seeds[m]
                 )));
             }
@@ -314,7 +314,7 @@ pub fn enough_to_score(others: usize, target: usize, options: &DensityOptions) -
     for (what, rows) in [("other", others), ("target", target)] {
         if rows < options.neighbour {
             return Err(Error::Failed(format!(
-                "joint.scores: found {rows} {what} rows, expected at least joint.scores.neighbour = {}; lower it, or give more rows",
+                "single_stage.scores: found {rows} {what} rows, expected at least single_stage.scores.neighbour = {}; lower it, or give more rows",
                 options.neighbour
             )));
         }

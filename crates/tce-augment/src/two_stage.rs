@@ -16,7 +16,7 @@ use tce_nn::is_cpu;
 
 use crate::config::{GeneratorConfig, Length};
 use crate::error::{Error, Result};
-use crate::score_training::{Course, Figures, Ready, held_out_rows, progress, run, start_rows};
+use crate::score_training::{Course, Metrics, Ready, held_out_rows, progress, run, start_rows};
 use crate::units::Units;
 use crate::work::Work;
 
@@ -94,23 +94,24 @@ impl Generator {
         let (state_data, transition_data, held_out) = (tables.state()?, tables.transition()?, tables.held_out()?);
         let [held_out_state, held_out_transition] = [0, 1].map(|k| held_out.as_ref().map(|data| &data[k]));
         let members = work.streams();
-        let judge_states = |trainer: &Trainer| losses(trainer, held_out_state, &state_data);
+        let state_losses = |trainer: &Trainer| losses(trainer, held_out_state, &state_data);
         // What a learner will see are actions, so that they decide: the held-out loss of q_tran rises long before they are right.
-        let judge_successors = |trainer: &Trainer| -> Result<Figures> {
-            let labels = labels.ok_or_else(|| Error::Failed("q_tran cannot be judged without label models".into()))?;
+        let successor_losses = |trainer: &Trainer| -> Result<Metrics> {
+            let labels =
+                labels.ok_or_else(|| Error::Failed("q_tran cannot be measured without label models".into()))?;
             let draw = Draw::new(&config.sampler, &members, target);
             let errors = implied_errors(&units, &trainer.model(), labels, &tables.held_out, &draw)?;
-            let mut figures = vec![("implied_action_error", errors)];
-            figures.extend(losses(trainer, held_out_transition, &transition_data)?);
-            Ok(figures)
+            let mut metrics = vec![("implied_action_error", errors)];
+            metrics.extend(losses(trainer, held_out_transition, &transition_data)?);
+            Ok(metrics)
         };
         let state_course = match config.state_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.state(), judge: &judge_states },
+            Length::Auto => Course::UntilDone { plan: config.until_done.state(), criterion: &state_losses },
         };
         let transition_course = match config.transition_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.transition(), judge: &judge_successors },
+            Length::Auto => Course::UntilDone { plan: config.until_done.transition(), criterion: &successor_losses },
         };
         let (state, transition) =
             train_both([&state_data, &transition_data], [&state_course, &transition_course], config, work)?;
@@ -260,7 +261,7 @@ fn target_states(rows: &[f32], dims: usize) -> Result<ScoreData<'_>> {
 const PROBE_BATCHES: u64 = 64;
 
 /// The losses of a network on rows that it does not see, if there are any, and on those that it sees.
-fn losses(trainer: &Trainer, held_out: Option<&ScoreData>, seen: &ScoreData) -> Result<Figures> {
+fn losses(trainer: &Trainer, held_out: Option<&ScoreData>, seen: &ScoreData) -> Result<Metrics> {
     let of = |data: &ScoreData| trainer.loss_on(std::slice::from_ref(data), PROBE_BATCHES);
     let held_out = held_out.map(of).transpose()?;
     Ok(held_out.map(|l| ("held_out_loss", l)).into_iter().chain([("training_loss", of(seen)?)]).collect())

@@ -23,11 +23,11 @@ pub use files::{
 pub use interrupt::{interrupted, listen_for_interrupts, set_interrupted};
 pub use metrics::Metrics;
 pub use owner::Owner;
+pub use progress::{Progress, Running, running};
 pub use random::{Rng, Streams};
 pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use statistics::{mean_std, plus_minus};
-pub use progress::{Progress, Running, running};
 pub use terminal::{set_listener, set_quiet};
 pub use words::{did_you_mean, file_inside, nearest};
 

@@ -87,16 +87,16 @@ impl Metrics {
     }
 }
 
-/// The values named `figure` of `member` in the stage `stage` of a `metrics.jsonl`, by step; nothing where there is no such file.
+/// The values named `metric` of `member` in the stage `stage` of a `metrics.jsonl`, by step; nothing where there is no such file.
 ///
 /// # Errors
 /// If the file cannot be read.
-pub fn recorded(path: &Path, stage: &str, member: usize, figure: &str) -> Result<BTreeMap<u64, f64>, FileError> {
+pub fn recorded(path: &Path, stage: &str, member: usize, metric: &str) -> Result<BTreeMap<u64, f64>, FileError> {
     let text = read_if_there(path)?.unwrap_or_default();
     let text = String::from_utf8_lossy(&text);
     let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
     let own = lines.filter(|line| line.stage == stage && line.member == member);
-    Ok(own.filter_map(|line| Some((line.step, line.values.get(figure)?.as_f64()?))).collect())
+    Ok(own.filter_map(|line| Some((line.step, line.values.get(metric)?.as_f64()?))).collect())
 }
 
 /// One line of `metrics.jsonl`.

@@ -1,8 +1,8 @@
 //! What bars, the line above them and notes share: one thing that draws on stderr.
 
 use std::io::IsTerminal;
-use std::sync::{LazyLock, PoisonError, RwLock};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{LazyLock, PoisonError, RwLock};
 use std::time::Instant;
 
 use console::style;

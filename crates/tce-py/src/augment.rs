@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use pyo3::prelude::*;
 use tce_data::Transitions;
-use tce_run::augmentation::Augmented;
+use tce_run::augment::own_tables::Augmented;
 use tce_run::config::Config;
 use tce_run::inputs::Inputs;
 use tce_run::own::Own;

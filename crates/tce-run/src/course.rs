@@ -11,7 +11,7 @@ use tce_base::{Step, plan_course, sha256_hex};
 use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
-use crate::processor::Processor;
+use crate::device_kind::DeviceKind;
 
 /// The file with costs, in the folder of runs.
 const COSTS: &str = "costs.json";
@@ -21,7 +21,7 @@ pub struct Course<'a> {
     /// What the sizes of networks depend on: the robot, or the columns of the data.
     robot: String,
     seeds: usize,
-    device: Processor,
+    device: DeviceKind,
     root: &'a Path,
     steps: Vec<Step>,
 }
@@ -80,8 +80,8 @@ impl<'a> Course<'a> {
                 self.step("generated rows", json!([g.sampler, g.rows, g.support]));
             }
             GeneratedRows::Synther | GeneratedRows::Dmc => {
-                self.step("joint network", json!(config.joint));
-                self.step("generated rows", json!([config.joint.sampler, config.joint.rows]));
+                self.step("single-stage network", json!(config.single_stage));
+                self.step("generated rows", json!([config.single_stage.sampler, config.single_stage.rows]));
             }
         }
         let (earlier, own) = self.steps.split_at_mut(before);
@@ -141,7 +141,7 @@ mod tests {
         for variant in [Variant::Bc, Variant::TceOg, Variant::TceNn] {
             let config = Layered::new(Preset::Quick, None, Some(variant), None, &[]).unwrap().config().unwrap();
             course.generating(&config);
-            course.learning(&variant.name(), &config, config.mixture.generated != GeneratedRows::None);
+            course.learning(variant.name(), &config, config.mixture.generated != GeneratedRows::None);
         }
         let steps: Vec<_> = course.steps.iter().map(|s| (s.name.as_str(), s.size)).collect();
         let expected = [

@@ -80,7 +80,8 @@ impl Inputs {
         extra: Option<(Transitions, Option<&[f32]>)>,
         own: &Own,
     ) -> Result<Self> {
-        let (target, source) = (Table::in_memory(target, "target"), source.map(|rows| Table::in_memory(rows, "source")));
+        let (target, source) =
+            (Table::in_memory(target, "target"), source.map(|rows| Table::in_memory(rows, "source")));
         let besides = |(rows, origin): (Transitions, Option<&[f32]>)| {
             let Table { rows, hash, complete, .. } = Table::in_memory(rows, "extra");
             Table::without_target(complete.unwrap_or(rows), origin, Path::new("extra"), hash, &target)

@@ -126,7 +126,7 @@ impl Layered {
         Ok(layered)
     }
 
-    /// Eq. 10 is TCE's: rivals that stand on IQL as it is have no such term, unless it comes from somewhere else than `presets`.
+    /// Eq. 10 is TCE's: prior methods that build on plain IQL have no such term, unless it comes from somewhere else than `presets`.
     fn without_tce_regulariser(&mut self, presets: &[&str]) -> Result<()> {
         let algorithm = self.table["learner"].get("algorithm").and_then(Value::as_str).unwrap_or_default().to_owned();
         let key = "learner.iql.regulariser";
@@ -185,7 +185,19 @@ impl Layered {
 }
 
 fn parse(text: &str, name: &str) -> Result<Table> {
-    text.parse::<Table>().map_err(|e| Error::Usage(format!("{name}: not TOML: {}", e.to_string().trim_end())))
+    let parsed = text.parse::<Table>();
+    let mut table = parsed.map_err(|e| Error::Usage(format!("{name}: not TOML: {}", e.to_string().trim_end())))?;
+    with_current_names(&mut table);
+    Ok(table)
+}
+
+/// Renames tables that earlier versions called otherwise: `joint` is `single_stage`.
+pub(crate) fn with_current_names(table: &mut Table) {
+    if !table.contains_key("single_stage")
+        && let Some(value) = table.remove("joint")
+    {
+        table.insert("single_stage".to_owned(), value);
+    }
 }
 
 /// `learner.steps=1000` as a table; what is no TOML value is a string.
@@ -197,7 +209,10 @@ fn parse_set(set: &str) -> Result<Table> {
         value = Value::Table(Table::from_iter([(part.to_owned(), value)]));
     }
     match value {
-        Value::Table(table) => Ok(table),
+        Value::Table(mut table) => {
+            with_current_names(&mut table);
+            Ok(table)
+        }
         _ => Err(Error::Usage(format!("--set {set}: expected key=value"))),
     }
 }
@@ -330,7 +345,7 @@ mod tests {
         assert_eq!(config.generator, GeneratorConfig::recommended());
         assert_eq!(config.filter, FilterConfig::recommended());
         assert_eq!(config.labels, LabelsConfig::recommended());
-        assert_eq!(config.joint, SingleStageConfig::recommended());
+        assert_eq!(config.single_stage, SingleStageConfig::recommended());
     }
 
     #[test]
@@ -385,17 +400,30 @@ mod tests {
         assert_eq!(origin("learner.iql.expectile"), "preset default");
     }
 
-    /// The behaviour term is TCE's. Rivals have one of their own or none, unless somebody asks for it.
+    /// The behaviour term is TCE's. Prior methods have one of their own or none, unless somebody asks for it.
     #[test]
-    fn rivals_have_no_term_of_tce() {
+    fn prior_methods_have_no_term_of_tce() {
         let regulariser =
             |sets: &[&str]| layered(Preset::Quick, None, sets).unwrap().config().unwrap().learner.iql.regulariser;
         assert_eq!(regulariser(&[]), RegulariserKind::ForwardKl);
-        for rival in ["dara", "srpo", "igdf"] {
-            let algorithm = format!("learner.algorithm={rival}");
+        for method in ["dara", "srpo", "igdf"] {
+            let algorithm = format!("learner.algorithm={method}");
             assert_eq!(regulariser(&[&algorithm]), RegulariserKind::None);
             assert_eq!(regulariser(&[&algorithm, "learner.iql.regulariser=forward_kl"]), RegulariserKind::ForwardKl);
         }
+    }
+
+    /// `[single_stage]` was `[joint]`: files, `--set` and keys of runs from then stay good.
+    #[test]
+    fn the_old_name_of_a_table_is_read() {
+        let config = |set: &str| layered(Preset::Default, None, &[set]).unwrap().config().unwrap();
+        let (old, new) = (config("joint.steps=7"), config("single_stage.steps=7"));
+        assert_eq!((old.single_stage.steps, &old), (7, &new));
+        assert!(new.to_toml().contains("\n[single_stage.guidance]") && !new.to_toml().contains("joint"));
+        let keyed = new.to_keyed_toml();
+        assert!(keyed.contains("\n[joint]\n") && !keyed.contains("single_stage"));
+        assert_eq!(toml::from_str::<Config>(&keyed).unwrap(), new);
+        assert!(serde_json::to_value(&new).unwrap().get("joint").is_some(), "what keys are hashed from");
     }
 
     #[test]

@@ -19,7 +19,7 @@ use toy::ToyConfig;
 macro_rules! learners {
     ($($variant:ident($what:literal) => $table:ident $(: $config:ident($keys:literal))?;)*) => {
         /// Which algorithm learns the policy; what each of them is, `tce learn --list` tells.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
         #[serde(rename_all = "kebab-case")]
         pub enum Algorithm {
             $(#[doc = $what] $variant,)*
@@ -41,7 +41,7 @@ macro_rules! learners {
             /// Share of the best trajectories that `bc` clones. 1: all of them. Source: "BC-10 %" of Chen et al.
             #[schemars(range(min = 0.001, max = 1.0))]
             pub top: f64,
-            /// Implicit Q-learning, and what the rivals that stand on it take from it.
+            /// Implicit Q-learning, and what the prior methods that stand on it take from it.
             pub iql: IqlConfig,
             $($(
                 // Runs that were done before there was this method have no such table.

@@ -1,13 +1,12 @@
 //! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
 
-pub mod augmentation;
+pub mod augment;
 pub mod config;
 pub mod course;
+pub mod device_kind;
 pub mod diagnosis;
 pub mod error;
-pub mod expand;
 pub mod inputs;
-pub mod judge;
 pub mod kept;
 pub mod keys;
 pub mod layers;
@@ -15,9 +14,9 @@ pub mod learners;
 pub mod learning;
 pub mod methods;
 pub mod mixture;
+pub mod off_policy_evaluation;
 pub mod own;
 pub mod pipeline;
-pub mod processor;
 pub mod recipe;
 pub mod stage;
 pub mod study;

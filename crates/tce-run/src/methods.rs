@@ -33,9 +33,9 @@ pub fn build(
 pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -> Result<Option<Arc<Vec<f32>>>> {
     let (rows, near) = (Rows::transitions(others), Rows::transitions(target));
     Ok(match config.learner.algorithm.about().scores {
-        RowScores::Transport => Some(closeness(transport_costs(&rows, &near, &TransportOptions::default())?)),
+        RowScores::Transport => Some(negated_costs(transport_costs(&rows, &near, &TransportOptions::default())?)),
         RowScores::Density => {
-            let options = &config.joint.scores;
+            let options = &config.single_stage.scores;
             enough_to_score(others.len(), target.len(), options)?;
             Some(Arc::new(density_scores(&rows, &near, options, &score_streams())?.source))
         }
@@ -44,6 +44,6 @@ pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -
 }
 
 /// -cost: the greater the closer.
-pub fn closeness(costs: Vec<f32>) -> Arc<Vec<f32>> {
+pub fn negated_costs(costs: Vec<f32>) -> Arc<Vec<f32>> {
     Arc::new(costs.into_iter().map(|c| -c).collect())
 }

@@ -21,8 +21,8 @@ use tce_base::metrics::Metrics;
 use tce_base::{FileError, Owner, PROGRAM, link_first, read_if_there, sha256_file, sha256_hex, write_json};
 use tce_nn::{Checkpoints, Device};
 
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
-use crate::processor::Processor;
 
 /// Changes when the same specification would give other bytes.
 const FORMAT: u32 = 4;
@@ -54,7 +54,7 @@ impl Stage {
     /// computes is a stage of its own: it has other bytes.
     pub fn open<S: Serialize>(root: &Path, name: &str, spec: &S, device: &Device) -> Result<Self> {
         let mut spec = serde_json::json!({ "format": FORMAT, "stage": name.rsplit('/').next(), "spec": spec });
-        Processor::from(device).sign(&mut spec);
+        DeviceKind::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let directory = root.join(format!("{name}-{}", &key[..12]));
         fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;

@@ -5,7 +5,7 @@
 //! | `policy-seedN.safetensors` | the policies, one per seed |
 //! | `policy.safetensors` | the recommended one |
 //! | `verdict.json` | why it is recommended |
-//! | `floor/` | the clones of the target rows, where the policies learned from more than those |
+//! | `baseline/` | the clones of the target rows, where the policies learned from more than those |
 //! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | how it went, and what decided it |
 //!
 //! The same run in the same directory is taken from it, or resumed from its checkpoints.
@@ -22,13 +22,13 @@ use tce_zoo::actors::Arena;
 
 use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::course::{Course, learning};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, Table};
-use crate::judge::Judge;
 use crate::learning::{Learned, MemberData, learn, save_policies};
 use crate::methods::row_scores;
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
-use crate::processor::Processor;
 use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
 /// The name of the baseline: what stands beside policies that more than the target rows were used for.
@@ -126,9 +126,9 @@ impl TrainingRun<'_> {
         let verdict = match self.comparison {
             Comparison::Skip => None,
             Comparison::Recommend => {
-                let floor = inputs.extra.is_none();
-                let own = Candidate { name: method.name.into(), floor, files: policies.clone() };
-                let baseline = (!floor).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
+                let alone_is_baseline = inputs.extra.is_none();
+                let own = Candidate { name: method.name.into(), baseline: alone_is_baseline, files: policies.clone() };
+                let baseline = (!alone_is_baseline).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
                 Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
             }
         };
@@ -165,17 +165,17 @@ impl TrainingRun<'_> {
         Ok(self.seeds.iter().map(member).collect())
     }
 
-    /// What the target rows alone are good for: an ensemble of clones per seed, in `floor/`.
+    /// What the target rows alone are good for: an ensemble of clones per seed, in `baseline/`.
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
-        let directory = self.out.join("floor");
+        let directory = self.out.join("baseline");
         tce_base::begin_step(&learning(BASELINE));
         let mut files = Vec::new();
         learn(data, &learner, &self.config.evaluation, None, (&directory, key), device, |policies| {
             files = save_policies(policies, self.seeds, &directory, inputs)?;
             Ok(())
         })?;
-        Ok(Candidate { name: BASELINE.into(), floor: true, files })
+        Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 
     fn baseline_learner(&self) -> LearnerConfig {
@@ -183,11 +183,11 @@ impl TrainingRun<'_> {
     }
 
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
-        let judge = || Judge::train(inputs, &self.config.dynamics, self.out, device);
+        let evaluator = || OffPolicyEvaluator::train(inputs, &self.config.dynamics, self.out, device);
         // Without a simulator a single policy is tried, too: nothing else tells what it is worth.
         let alone = self.own.env.and_then(|_| only(&candidates));
         let fitted_q = (self.config.fitted_q.steps > 0).then_some((&self.config.fitted_q, device));
-        keep(alone.map_or_else(|| recommend(judge, &candidates, fitted_q), Ok)?, self.out)
+        keep(alone.map_or_else(|| recommend(evaluator, &candidates, fitted_q), Ok)?, self.out)
     }
 
     /// What decides the result.
@@ -199,7 +199,7 @@ impl TrainingRun<'_> {
         if let Some(source) = &inputs.source {
             spec["source"] = source.hash.clone().into();
         }
-        Processor::from(device).sign(&mut spec);
+        DeviceKind::from(device).sign(&mut spec);
         spec
     }
 
@@ -236,7 +236,7 @@ fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
         return Err(Error::Usage(format!(
             "{}: found {end} learning with other settings, seeds or files; choose another --out{}",
             out.display(),
-            if summary.is_some() { " (tce evaluate judges a policy that is there)" } else { ", or remove it" }
+            if summary.is_some() { " (tce evaluate tries a policy that is there)" } else { ", or remove it" }
         )));
     }
     let Some(bytes) = summary else { return Ok(None) };

@@ -156,7 +156,7 @@ impl Evaluation {
     }
 }
 
-/// Where policies are judged.
+/// Where policies are evaluated.
 #[derive(Clone, Copy, Debug)]
 pub struct Arena {
     /// The robot.

@@ -21,8 +21,8 @@ use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::world_model::Worlds;
 use tce_learn::{
-    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
-    MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
+    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, LearnError, Learner, Member, MetaDt, MetaDtConfig,
+    Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, TrainingJob, train_side_by_side,
 };
 use tce_nn::{Checkpoints, Device, is_cpu, on_threads_of, product_rate, tensor};
 use tce_run::config::Algorithm;
@@ -206,18 +206,18 @@ fn members(seeds: u64) -> Vec<Member> {
 }
 
 /// Ten steps a call of learners side by side, as [`tce_run::learning`] trains them.
-fn learning<L: Learner + ?Sized + 'static>(device: &Device, lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
-    let (device, seeds) = (device.clone(), lanes.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
-    let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = lanes.into_iter().unzip();
+fn learning<L: Learner + ?Sized + 'static>(device: &Device, jobs: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+    let (device, seeds) = (device.clone(), jobs.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
+    let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = jobs.into_iter().unzip();
     let mut from = 0;
     Body::new("updates", 10.0 * seeds as f64, flops, move || {
-        let mut lanes: Vec<_> = learners
+        let mut jobs: Vec<_> = learners
             .iter_mut()
             .zip(&buffers)
-            .map(|(learner, buffer)| Lane { learner: learner.as_mut(), buffer })
+            .map(|(learner, buffer)| TrainingJob { learner: learner.as_mut(), buffer })
             .collect();
         let steps = Steps { from, to: from + 10, report_every: 0 };
-        let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &device, |_, _, _| {
+        let done = train_side_by_side(&mut jobs, steps, "bench", &mut Checkpoints::none(), &device, |_, _, _| {
             Ok::<_, LearnError>(())
         });
         done.expect("nothing to fail");
@@ -232,10 +232,10 @@ fn row_products(widths: &[usize]) -> (f64, f64) {
 }
 
 /// The seeds as [`tce_run::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
-fn lanes<L>(on: &On, seeds: u64, lane: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
+fn jobs<L>(on: &On, seeds: u64, job: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
     let all = members(seeds);
     let size = if is_cpu(&on.device) { 1 } else { all.len() };
-    all.chunks(size).map(|members| lane(members.to_vec())).collect()
+    all.chunks(size).map(|members| job(members.to_vec())).collect()
 }
 
 fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
@@ -245,7 +245,7 @@ fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
         ..Default::default()
     };
     let device = &on.device;
-    let lane = |members| {
+    let job = |members| {
         let buffer = Buffer::new(members, BATCH).expect("good data");
         let regulariser = Regulariser::prepare(kind, &buffer, &small, Place::NONE, device)
             .expect("defaults")
@@ -260,7 +260,7 @@ fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
     );
     // V(s) and V(s'), the gradient of V; twins: target, online, gradient; policy and gradient. No gradient of an input.
     let products = 2.0 * v + (2.0 * v - v1) + 2.0 * (2.0 * q + 2.0 * q - q1) + (3.0 * pi - pi1);
-    learning(device, lanes(on, seeds, lane), 2.0 * BATCH as f64 * products)
+    learning(device, jobs(on, seeds, job), 2.0 * BATCH as f64 * products)
 }
 
 fn sac(On { device, .. }: &On) -> Body {
@@ -279,7 +279,7 @@ fn method(on: &On, algorithm: Algorithm) -> Body {
     let mut config = layered.and_then(|l| l.config()).expect("the default preset").learner;
     (config.algorithm, config.iql.regulariser) = (algorithm, RegulariserKind::None);
     (config.behaviour.cvae.steps, config.igdf.steps, config.bosa.cvae.steps) = (1, 1, 1);
-    let lane = |mut members: Vec<Member>| {
+    let job = |mut members: Vec<Member>| {
         for member in &mut members {
             member.row_scores = Some(Arc::new((0..member.parts[1].len()).map(|i| (i % 97) as f32).collect()));
         }
@@ -287,7 +287,7 @@ fn method(on: &On, algorithm: Algorithm) -> Body {
         let learner = build(&buffer, &config, Place::NONE, &on.device).expect("defaults");
         (buffer, learner)
     };
-    learning(&on.device, lanes(on, on.seeds, lane), 0.0)
+    learning(&on.device, jobs(on, on.seeds, job), 0.0)
 }
 
 fn bc(On { device, .. }: &On) -> Body {

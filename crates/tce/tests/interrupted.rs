@@ -37,7 +37,7 @@ fn start(directory: &Path, args: &[&str]) -> Child {
 }
 
 fn pipeline(out: &str) -> Vec<&str> {
-    let task = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--out", out];
+    let task = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-baselines", "--out", out];
     [&task[..], SMALL].concat()
 }
 
@@ -157,10 +157,17 @@ fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
 
 /// What BOSA, IGDF and Meta-DT train before their first step is gone on with too.
 #[test]
-fn rivals_killed_anywhere_learn_the_same() {
+fn prior_methods_killed_anywhere_learn_the_same() {
     let dir = tempfile::tempdir().unwrap();
-    let task =
-        ["run", "hopper-morph:medium->expert", "--variant", "bosa,igdf,otdf,meta-dt", "--no-floors", "--out", "runs"];
+    let task = [
+        "run",
+        "hopper-morph:medium->expert",
+        "--variant",
+        "bosa,igdf,otdf,meta-dt",
+        "--no-baselines",
+        "--out",
+        "runs",
+    ];
     let own = [
         "--set=learner.bosa.cvae.steps=150",
         "--set=learner.bosa.cvae.hidden=[16]",

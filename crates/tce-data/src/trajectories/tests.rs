@@ -60,7 +60,7 @@ fn falls_tell_where_the_pace_does_not() {
 }
 
 #[test]
-fn a_cut_trajectory_is_judged_by_its_age() {
+fn a_cut_trajectory_is_ranked_by_its_age() {
     for (reward, keep) in [(1.0, false), (3.0, true)] {
         for rows in [30, 100, 300, 800] {
             let t = data(

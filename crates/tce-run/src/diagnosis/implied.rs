@@ -1,8 +1,8 @@
 //! The policy that the generator implies, a = Inv(s, ŝ') with ŝ' ~ q_tran(· | s): its actions at real target states, and what it
-//! gets when it is rolled out. What the figures mean is told in [`tce_diagnosis::implied`].
+//! gets when it is rolled out. What the metrics mean is told in [`tce_diagnosis::implied`].
 //!
 //! The inverse dynamics model has its own held-out rows, drawn one by one: most of those that q_tran has not seen it has. Its own error
-//! at the same rows stands beside the figures.
+//! at the same rows stands beside the metrics.
 
 use rand::RngExt;
 use tce_augment::two_stage::{Draw, Generator};

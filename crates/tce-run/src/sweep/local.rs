@@ -11,8 +11,8 @@ use tce_base::format::about;
 use tce_base::{FileError, Headline, Progress, interrupted};
 
 use super::{Entry, Sweep};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
-use crate::processor::Processor;
 
 /// Time between two looks at how long the rest takes.
 const LOOK: Duration = Duration::from_secs(3);
@@ -29,7 +29,7 @@ pub struct Share {
     /// Seconds between checkpoints.
     pub save_every: f64,
     /// What computes the networks.
-    pub processor: Processor,
+    pub device: DeviceKind,
 }
 
 impl Sweep {
@@ -125,7 +125,7 @@ impl Sweep {
         let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let mut command = Command::new(program);
         command.args(["--threads", &share.threads.to_string(), "--save-every", &share.save_every.to_string()]);
-        command.args(["--device", &share.processor.to_string()]);
+        command.args(["--device", &share.device.to_string()]);
         command.args(["sweep", "run-one"]).arg(&self.directory).arg(entry.index.to_string());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
         // A signal to the terminal's group would reach the workers twice, and a second one ends them at once.

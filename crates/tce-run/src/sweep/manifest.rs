@@ -28,9 +28,9 @@ pub struct Description {
     pub tasks: Vec<String>,
     /// Methods.
     pub variants: Vec<Variant>,
-    /// Whether the floors are run beside them.
-    #[serde(default = "yes")]
-    pub floors: bool,
+    /// Whether the baselines are run beside them.
+    #[serde(default = "yes", alias = "floors")]
+    pub baselines: bool,
     /// Seeds, one run each.
     #[serde(default = "one")]
     pub seeds: u64,
@@ -95,7 +95,9 @@ pub enum Kind {
     /// Distances of source rows to the target's, which several runs share.
     Distances,
     /// Networks, label models and generated rows, which several runs share.
-    Expand,
+    // The name in manifests, from which ids of work are hashed.
+    #[serde(rename = "expand")]
+    Augment,
     /// A policy and its score.
     Run,
 }
@@ -131,7 +133,7 @@ impl Entry {
     /// The method's column in tables.
     pub fn column(&self) -> String {
         let variant = self.variant.map(Variant::name).unwrap_or_default();
-        if self.label.is_empty() { variant } else { format!("{variant} {}", self.label) }
+        if self.label.is_empty() { variant.to_owned() } else { format!("{variant} {}", self.label) }
     }
 }
 
@@ -142,7 +144,7 @@ impl fmt::Display for Entry {
             Kind::Source => write!(f, "{index}: source rows, {}-{}", task.agent, task.source),
             Kind::Target => write!(f, "{index}: target rows, {}-{}-{}", task.agent, task.shift, task.target),
             Kind::Distances => write!(f, "{index}: distances of source rows, {task}"),
-            Kind::Expand => write!(f, "{index}: generated rows, {task}, seed {seed}"),
+            Kind::Augment => write!(f, "{index}: generated rows, {task}, seed {seed}"),
             Kind::Run => write!(f, "{index}: {}, {task}, seed {seed}", self.column()),
         }
     }
@@ -212,8 +214,8 @@ impl Manifest {
             }
         }
         let mut variants = description.variants.clone();
-        if description.floors {
-            variants.extend(Variant::FLOORS);
+        if description.baselines {
+            variants.extend(Variant::BASELINES);
         }
         let mut seen = BTreeSet::new();
         variants.retain(|v| seen.insert(*v));
@@ -281,7 +283,7 @@ impl Manifest {
         config: &Config,
         seed: u64,
     ) {
-        let text = config.to_toml();
+        let text = config.to_keyed_toml();
         let hash = sha256_hex(text.as_bytes())[..16].to_owned();
         self.header.configs.insert(hash.clone(), text);
         let (data, from_zoo) = (self.header.data.get(&task).cloned().unwrap_or_default(), self.header.from_zoo);
@@ -315,7 +317,7 @@ impl Manifest {
         if generated != GeneratedRows::None || config.mixture.source == SourceRows::Relabelled {
             let own = match generated {
                 GeneratedRows::Synther | GeneratedRows::Dmc => {
-                    serde_json::json!(used_of_single_stage(&config.joint, generated, config.learner.algorithm))
+                    serde_json::json!(used_of_single_stage(&config.single_stage, generated, config.learner.algorithm))
                 }
                 GeneratedRows::Tce | GeneratedRows::None => {
                     let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
@@ -326,7 +328,7 @@ impl Manifest {
             };
             let spec = serde_json::json!([task, data, from_zoo, rows, generated, own, seed]);
             let before = needs.clone();
-            needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
+            needs.push(self.add(known, entry(Kind::Augment, spec, seed, before)));
         }
         let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
         let run = entry(Kind::Run, spec, seed, needs);

@@ -12,9 +12,9 @@ use tce_base::{FileError, Owner, PROGRAM, read_if_there, sha256_file, write_json
 use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
+use crate::augment::{augment_rows, label_models};
 use crate::config::GeneratedRows;
 use crate::error::{Error, Result};
-use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
 use crate::mixture::distances_stage;
 use crate::pipeline::run;
@@ -198,11 +198,11 @@ impl Sweep {
         let (score, place, files) = match entry.kind {
             Kind::Source => data_file(&source_file(entry.task, &args, config.source.rows)?)?,
             Kind::Target => data_file(&target_file(entry.task, &args)?)?,
-            Kind::Expand => {
+            Kind::Augment => {
                 let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let stage = match config.mixture.generated {
                     GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, device)?.1,
-                    _ => expand(&inputs, &config, seeds, root, device)?.stage,
+                    _ => augment_rows(&inputs, &config, seeds, root, device)?.stage,
                 };
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
             }
@@ -265,7 +265,8 @@ mod tests {
     fn the_first_outcome_stays_and_another_one_is_a_fault() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("s.toml");
-        fs::write(&path, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nfloors = false\n").unwrap();
+        fs::write(&path, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nbaselines = false\n")
+            .unwrap();
         let sweep = Sweep::create(&dir.path().join("s"), Manifest::plan(&path).unwrap()).unwrap();
         let entry = sweep.entries().last().unwrap();
         let outcome = |score: f64, seconds: f64| Outcome {

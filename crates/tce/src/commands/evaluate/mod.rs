@@ -1,7 +1,7 @@
 //! `tce evaluate`.
 
 #[cfg(feature = "video")]
-mod film;
+mod video;
 
 use std::path::PathBuf;
 
@@ -36,7 +36,7 @@ pub struct Evaluate {
     seed: u64,
     #[cfg(feature = "video")]
     #[command(flatten)]
-    film: film::FilmArgs,
+    video: video::VideoArgs,
 }
 
 #[derive(Serialize)]
@@ -47,7 +47,7 @@ struct Evaluated {
     evaluation: Evaluation,
     #[cfg(feature = "video")]
     #[serde(skip_serializing_if = "Option::is_none")]
-    video: Option<film::Filmed>,
+    video: Option<video::VideoReport>,
 }
 
 impl Evaluate {
@@ -60,18 +60,18 @@ impl Evaluate {
         let (agent, shift) = self.env;
         let arena = Arena::new(agent, shift, ScoreTable::default());
         #[cfg(feature = "video")]
-        let studio = self.film.studio(&self.policies)?;
+        let writer = self.video.writer(&self.policies)?;
         let policies: Vec<_> = self.policies.iter().map(|p| load_policy(p, agent)).collect::<tce_zoo::Result<_>>()?;
         #[cfg(feature = "video")]
-        if let Some(studio) = studio {
+        if let Some(writer) = writer {
             let roll = |arena, episodes| {
                 let streams = Streams::new(self.seed);
                 Ok(evaluate_recorded(&policies[0], arena, episodes, streams, !self.sample, interrupted)?)
             };
-            let (evaluation, video) = self.film.film(studio, arena, roll, self.episodes)?;
+            let (evaluation, video) = self.video.record(writer, arena, roll, self.episodes)?;
             let environment = format!("{agent}-{shift}");
-            let film = Evaluated { policy: self.policies[0].clone(), environment, evaluation, video: Some(video) };
-            output.print(&[film], |all| render(all));
+            let video = Evaluated { policy: self.policies[0].clone(), environment, evaluation, video: Some(video) };
+            output.print(&[video], |all| render(all));
             return Ok(());
         }
         let mut all = Vec::new();

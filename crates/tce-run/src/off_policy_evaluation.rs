@@ -10,7 +10,7 @@
 //! Halting where the data end is MOReL's (Kidambi et al. 2020). It is shown and decides nothing: on HalfCheetah, kinematic, policies of 686,
 //! 3130 and 3766 have 926, 1985 and 906 (bench/expansion.md).
 //!
-//! | figure | meaning |
+//! | metric | meaning |
 //! |---|---|
 //! | imagined return | mean return of the imagined episodes |
 //! | supported return | the same until the episode is far from the target's states |
@@ -50,7 +50,7 @@ const WORST: f64 = 0.01;
 const MARGIN: f32 = 0.25;
 
 /// The trained ensemble, and how it does on target rows that it has not seen.
-pub struct Judge {
+pub struct OffPolicyEvaluator {
     /// The ensemble.
     pub dynamics: Dynamics,
     /// Errors of the held-out target rows, ascending, in steps.
@@ -72,7 +72,7 @@ pub struct Judge {
 
 /// What a policy does in the learned model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judged {
+pub struct OffPolicyEstimate {
     /// Mean return of the imagined episodes.
     pub imagined_return: f64,
     /// Standard error of it, over the networks and the starts.
@@ -89,7 +89,7 @@ pub struct Judged {
     pub returns: Vec<f64>,
 }
 
-impl Judge {
+impl OffPolicyEvaluator {
     /// Trains the ensemble on the target's and, if there are any, the source's rows, or takes it from its stage.
     pub fn train(inputs: &Inputs, config: &DynamicsConfig, root: &Path, device: &Device) -> Result<Self> {
         #[derive(Serialize)]
@@ -159,7 +159,7 @@ impl Judge {
     }
 
     /// Tries a policy.
-    pub fn judge(&self, policy: &Policy) -> Result<Judged> {
+    pub fn evaluate(&self, policy: &Policy) -> Result<OffPolicyEstimate> {
         let t = &self.target;
         let starts = starts(t);
         let networks = self.dynamics.members();
@@ -222,7 +222,7 @@ impl Judge {
         let n = returns.len() as f64;
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
-        Ok(Judged {
+        Ok(OffPolicyEstimate {
             imagined_return: mean,
             standard_error: std / n.sqrt(),
             supported_return: mean_std(&supported).0,
@@ -234,7 +234,7 @@ impl Judge {
     }
 }
 
-impl Judge {
+impl OffPolicyEvaluator {
     /// The returns of episodes until they leave what the models know: where they `left` its bounds, or where one of the states that they
     /// `passed` is far from the target's, whichever comes first. `distances` are those of the passed states, in the order of the steps.
     fn counted(

@@ -1,4 +1,4 @@
-//! The rivals and the deterministic actor-critics, end to end on a corridor.
+//! Prior methods and the deterministic actor-critics, end to end on a corridor.
 
 mod common;
 
