@@ -82,7 +82,7 @@ pub enum Length {
 }
 
 impl Serialize for Length {
-    fn serialize<S: serde::Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {
             Length::Steps(steps) => to.serialize_u64(*steps),
             Length::Auto => to.serialize_str("auto"),
@@ -101,21 +101,21 @@ impl schemars::JsonSchema for Length {
 }
 
 impl<'de> Deserialize<'de> for Length {
-    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<Self, D::Error> {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Visitor;
         impl serde::de::Visitor<'_> for Visitor {
             type Value = Length;
             fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
                 f.write_str("a number of updates, or \"auto\"")
             }
-            fn visit_u64<E>(self, steps: u64) -> std::result::Result<Length, E> {
+            fn visit_u64<E>(self, steps: u64) -> Result<Length, E> {
                 Ok(Length::Steps(steps))
             }
-            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> std::result::Result<Length, E> {
+            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> Result<Length, E> {
                 let negative = |_| E::invalid_value(serde::de::Unexpected::Signed(steps), &self);
                 u64::try_from(steps).map(Length::Steps).map_err(negative)
             }
-            fn visit_str<E: serde::de::Error>(self, word: &str) -> std::result::Result<Length, E> {
+            fn visit_str<E: serde::de::Error>(self, word: &str) -> Result<Length, E> {
                 match word {
                     "auto" => Ok(Length::Auto),
                     _ => Err(E::invalid_value(serde::de::Unexpected::Str(word), &self)),
@@ -232,7 +232,7 @@ pub struct LabelsConfig {
 impl LabelsConfig {
     /// What measures best with one setting for all tasks: the values of the preset `default`.
     pub fn recommended() -> Self {
-        Self { terminal: Terminal::Rule, training: LabelConfig { steps: 20_000, ..LabelConfig::default() } }
+        Self { terminal: Terminal::Rule, training: LabelConfig { steps: 20_000, ..LabelConfig::paper() } }
     }
 
     /// Where terminal flags come from, for a robot whose rule is known or not, and data with or without terminal rows: a rule only where

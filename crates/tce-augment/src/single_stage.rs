@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{DensityOptions, DensityScale, Rows, Standardizer, Transitions, further_scores};
 use tce_diffusion::{
-    Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
+    Balance, Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
     uniform_labels,
 };
 
@@ -131,6 +131,7 @@ pub struct ScoreUnits {
 }
 
 impl ScoreUnits {
+    /// The range of `scores`.
     pub fn fit(scores: &[f32]) -> Self {
         let units = Standardizer::fit(scores, 1);
         Self { mean: units.mean[0], std: units.std[0] }
@@ -208,11 +209,16 @@ impl SingleStage {
         });
         let data = match &on {
             // No condition at all is the one that DmC's network learns beside the others.
-            None => {
-                ScoreData::new(vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?
+            None => ScoreData::new(
+                vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }],
+                d,
+                c,
+                Balance::Rows,
+            )?,
+            Some((_, on)) => {
+                ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, Balance::Rows)?
+                    .with_dropout(config.guidance.dropout)?
             }
-            Some((_, on)) => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, false)?
-                .with_dropout(config.guidance.dropout)?,
         };
         let SingleStageConfig { width, embedding, blocks, process, steps, .. } = *config;
         let network = NetworkConfig { width, embedding, blocks, ..NetworkConfig::new(d, c) };

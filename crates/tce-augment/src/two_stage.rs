@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{Support, Transitions};
 use tce_diffusion::{
-    Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel,
+    Balance, Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel,
     TrainConfig, Trainer, uniform_labels,
 };
 use tce_learn::{LabelModels, rmse};
@@ -197,7 +197,7 @@ impl Generator {
 struct Tables {
     /// Live dimensions.
     dims: usize,
-    balanced: bool,
+    balance: Balance,
     /// `[rows, dims]`; None where q_mix sees target states alone.
     source_states: Option<Vec<f32>>,
     states: Vec<f32>,
@@ -217,7 +217,7 @@ impl Tables {
         let (states, outputs) = (units.states(&target.observations), units.outputs(target));
         Self {
             dims,
-            balanced: config.balanced,
+            balance: if config.balanced { Balance::Parts } else { Balance::Rows },
             source_states: source.map(|t| units.states(&t.observations)),
             states: pick(&states, &kept),
             outputs: pick(&outputs, &kept),
@@ -230,7 +230,7 @@ impl Tables {
     /// Of q_mix: the label says whose state it is (Eq. 5).
     fn state(&self) -> Result<ScoreData<'_>> {
         Ok(match &self.source_states {
-            Some(source) => ScoreData::labelled(source, &self.states, self.dims, self.balanced)?,
+            Some(source) => ScoreData::labelled(source, &self.states, self.dims, self.balance)?,
             None => target_states(&self.states, self.dims)?,
         })
     }
@@ -254,7 +254,7 @@ impl Tables {
 /// States under the target's label.
 fn target_states(rows: &[f32], dims: usize) -> Result<ScoreData<'_>> {
     let condition = Condition::Constant(vec![0.0]);
-    Ok(ScoreData::new(vec![Part { rows, condition }], dims, 1, false)?)
+    Ok(ScoreData::new(vec![Part { rows, condition }], dims, 1, Balance::Rows)?)
 }
 
 /// Batches of a loss that tells when to stop: 8192 draws of a row, a noise level and noise at 128 rows a batch.
@@ -298,7 +298,7 @@ fn train_both(
     };
     match results {
         // The one that diverged is the reason, not the one that was stopped for it.
-        (Err(Error::Diffusion(DiffusionError::Interrupted { .. })), Err(reason)) | (Err(reason), _) => Err(reason),
+        (Err(Error::Diffusion(DiffusionError::Interrupted(_))), Err(reason)) | (Err(reason), _) => Err(reason),
         (Ok(state), transition) => Ok((state, transition?)),
     }
 }

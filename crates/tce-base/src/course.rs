@@ -140,11 +140,20 @@ pub fn begin_step(name: &str) {
     }
 }
 
-/// The command has come to its end, so that its line goes away. `whole`: the last step came to its end, too.
-pub fn end_course(whole: bool) {
+/// How the last step of a command ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LastStep {
+    /// It is done: what it cost is remembered.
+    Done,
+    /// An error or an interruption ended it.
+    BrokenOff,
+}
+
+/// The command has come to its end, so that its line goes away.
+pub fn end_course(last: LastStep) {
     let ended = course().take();
     drop(HEADLINE.lock().unwrap_or_else(PoisonError::into_inner).take());
-    if let (Some(mut course), true) = (ended, whole) {
+    if let (Some(mut course), true) = (ended, last == LastStep::Done) {
         let before = course.costs.clone();
         course.end(Instant::now());
         // A command that found everything done changes nothing.

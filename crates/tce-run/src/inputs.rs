@@ -35,6 +35,22 @@ pub struct Inputs {
     limit: Option<usize>,
 }
 
+/// Which data a stage looks at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Domains {
+    /// The target's alone.
+    Target,
+    /// Those of both domains, where there is a source.
+    Both,
+}
+
+impl Domains {
+    /// Both, if the source is needed.
+    pub fn with_source(needed: bool) -> Self {
+        if needed { Self::Both } else { Self::Target }
+    }
+}
+
 /// What identifies the inputs in a specification.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct InputSpec {
@@ -243,9 +259,9 @@ impl Inputs {
     }
 
     /// [`Inputs::spec`] of work that sees the imitated rows alone.
-    pub fn spec_imitated(&self, with_source: bool, config: &TargetConfig) -> InputSpec {
+    pub fn spec_imitated(&self, domains: Domains, config: &TargetConfig) -> InputSpec {
         let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
-        InputSpec { chosen, ..self.spec(with_source) }
+        InputSpec { chosen, ..self.spec(domains) }
     }
 
     /// Refuses files that do not fit, and brings all tables into the box.
@@ -297,13 +313,13 @@ impl Inputs {
         tables.map(|t| std::path::absolute(&t.file).unwrap_or_else(|_| t.file.clone())).collect()
     }
 
-    /// What identifies these inputs; with `source` left out for stages that do not look at it.
-    pub fn spec(&self, with_source: bool) -> InputSpec {
+    /// What identifies these inputs; without the source for stages that do not look at it.
+    pub fn spec(&self, domains: Domains) -> InputSpec {
         InputSpec {
             agent: self.agent,
             shift: self.shift,
             target: self.target.hash.clone(),
-            source: self.source.as_ref().filter(|_| with_source).map(|s| s.hash.clone()),
+            source: self.source.as_ref().filter(|_| domains == Domains::Both).map(|s| s.hash.clone()),
             chosen: None,
             actions: self.actions.clone(),
             step_limit: self.limit,

@@ -348,6 +348,40 @@ mod tests {
         assert_eq!(config.single_stage, SingleStageConfig::recommended());
     }
 
+    /// The library's settings of the paper are the preset's.
+    #[test]
+    fn the_library_has_the_paper_preset() {
+        use tce_learn::cvae::CvaeConfig;
+        use tce_learn::pair_model::PairInput;
+        use tce_learn::{BcConfig, IqlConfig, LabelConfig};
+        let paper = layered(Preset::Paper, None, &[]).unwrap().config().unwrap();
+        let term = IqlConfig { regulariser: RegulariserKind::ForwardKl, ..IqlConfig::paper() };
+        assert_eq!(paper.learner.iql, term);
+        assert_eq!(paper.learner.behaviour.cvae, CvaeConfig::paper());
+        let mut labels = LabelConfig::paper();
+        (labels.model.input, labels.model.cosine) = (PairInput::Next, false);
+        assert_eq!(paper.labels.training, labels);
+        assert_eq!(paper.learner.bc, BcConfig::default(), "one clone with the networks of IQL's policy");
+    }
+
+    /// What the program's own defaults say of a learner is what the default preset says; clones are the exception, see above.
+    #[test]
+    fn defaults_of_learners_are_those_of_the_default_preset() {
+        let learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;
+        let preset = serde_json::to_value(&learner).unwrap();
+        for (name, table) in default_tables().into_iter().filter(|(name, _)| *name != "bc") {
+            let own = serde_json::to_value(table).unwrap();
+            let (own, preset) = (own.as_object().unwrap(), preset[name].as_object().unwrap());
+            for (key, value) in own {
+                let same = match (value.as_f64(), preset[key].as_f64()) {
+                    (Some(a), Some(b)) => (a - b).abs() <= 1e-6 * a.abs(),
+                    _ => *value == preset[key],
+                };
+                assert!(same, "{name}.{key}: {value} and {}", preset[key]);
+            }
+        }
+    }
+
     #[test]
     fn mixtures_are_cloned_for_fewer_steps() {
         let mut learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;

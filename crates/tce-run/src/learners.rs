@@ -95,7 +95,7 @@ macro_rules! learners {
 /// The default configuration of a table's method.
 macro_rules! fresh {
     (iql) => {
-        IqlConfig::default()
+        IqlConfig::paper()
     };
     ($table:ident $config:ident) => {
         $config::default()
@@ -135,7 +135,7 @@ impl Algorithm {
 
     /// Whether it stands on IQL as `learner.iql` has it, without being IQL.
     pub fn stands_on_plain_iql(self) -> bool {
-        let iql = IqlConfig::default();
+        let iql = IqlConfig::paper();
         self != Self::Iql && self.fresh().backbone(&iql) == Some(iql)
     }
 }

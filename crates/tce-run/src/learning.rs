@@ -15,7 +15,7 @@ use tce_learn::{
 };
 use tce_nn::{Device, is_cpu};
 use tce_sim::SimError;
-use tce_zoo::actors::{Arena, Evaluation, evaluate};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::device_kind::DeviceKind;
@@ -137,7 +137,7 @@ pub fn learn(
         Ok::<_, Error>(())
     })?;
     if outcome.interrupted {
-        return Err(Error::Interrupted);
+        return Err(Error::interrupted());
     }
     let policies: Vec<Policy> = learners.iter().flat_map(|l| l.policies()).collect();
     keep(&policies)?;
@@ -205,7 +205,7 @@ fn evaluate_all(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Aren
         .par_iter()
         .zip(seeds)
         .map(|(p, &seed)| {
-            match evaluate(p, arena, episodes, Streams::new(seed), true, interrupted) {
+            match evaluate(p, arena, episodes, Streams::new(seed), Actions::Mean, interrupted) {
                 // One member that has diverged must not cost the others their result.
                 Err(tce_zoo::Error::Sim(e @ SimError::NotFinite { .. })) => {
                     tce_base::note!("seed {seed}: {e}; it has no score");

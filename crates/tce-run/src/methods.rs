@@ -22,7 +22,7 @@ pub fn build(
 ) -> Result<Box<dyn PolicyLearner>> {
     let LearnerConfig { steps, iql, behaviour, .. } = config;
     let on = Setup { buffer, steps: *steps, iql, behaviour, place, device };
-    config.own().build(&on)?.ok_or(Error::Interrupted)
+    config.own().build(&on)?.ok_or_else(Error::interrupted)
 }
 
 /// The number of every row of `others` that the learner of `config` chooses by, the greater the closer to the target; None if it

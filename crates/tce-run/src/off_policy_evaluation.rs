@@ -34,7 +34,7 @@ use tce_learn::{
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
 /// States from which a policy is tried, for each network of the ensemble.
@@ -98,7 +98,7 @@ impl OffPolicyEvaluator {
             config: &'a DynamicsConfig,
             held_out: f64,
         }
-        let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out: HELD_OUT };
+        let spec = Spec { inputs: inputs.spec(Domains::Both), config, held_out: HELD_OUT };
         tce_base::begin_step("learned dynamics");
         let stage = Stage::open(root, "stages/dynamics", &spec, device)?;
         let target = &inputs.target.rows;
@@ -117,7 +117,7 @@ impl OffPolicyEvaluator {
             None => {
                 let attempt = stage.attempt()?;
                 let trained = train_dynamics(dynamics, &mut attempt.checkpoints("dynamics")?, device)?;
-                dynamics = trained.ok_or(Error::Interrupted)?;
+                dynamics = trained.ok_or_else(Error::interrupted)?;
                 let mut errors = dynamics.errors(&target.select(&apart), Domain::Target);
                 errors.sort_by(f64::total_cmp);
                 dynamics.state().save(&attempt.file(file))?;
@@ -134,7 +134,7 @@ impl OffPolicyEvaluator {
             held_out,
             stage,
             root: root.to_owned(),
-            inputs: inputs.spec(false),
+            inputs: inputs.spec(Domains::Target),
             spacing: spacing(target),
             worst: worst_reward(target),
             target: Arc::new(target.clone()),
@@ -300,7 +300,7 @@ impl OffPolicyEvaluator {
         let attempt = stage.attempt()?;
         let mut checkpoints = attempt.checkpoints("fitted-q")?;
         let values = fitted_q(t, &starts, &actions, config, Streams::new(0), &mut checkpoints, device)?;
-        let values = values.ok_or(Error::Interrupted)?;
+        let values = values.ok_or_else(Error::interrupted)?;
         attempt.finish(&[], &values)?;
         Ok(values)
     }

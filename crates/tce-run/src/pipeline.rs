@@ -16,7 +16,7 @@ use crate::augment::single_stage;
 use crate::augment::{Generated, augment_rows, label_models};
 use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::methods::{negated_costs, row_scores};
 use crate::mixture::{distances, extra_rows};
@@ -77,7 +77,7 @@ impl<'a> RunSpec<'a> {
         let two_stages = config.mixture.generated == GeneratedRows::Tce;
         let relabelled = config.mixture.source == SourceRows::Relabelled;
         Self {
-            inputs: inputs.spec_imitated(config.needs_source(), &config.target),
+            inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
             mixture: &config.mixture,
             learner: config.learner.used(),

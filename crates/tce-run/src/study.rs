@@ -412,7 +412,7 @@ mod tests {
     #[test]
     fn a_column_is_called_what_its_runs_are() {
         let mut config = Variant::TceOg.own();
-        config.learner.algorithm = crate::config::Algorithm::Td3Bc;
+        config.learner.algorithm = Algorithm::Td3Bc;
         assert_eq!(method(Variant::TceOg, "", Some(&config)).title, "TCE(OG), td3-bc");
         assert_eq!(method(Variant::TceOg, "y0.1", None).title, "TCE(OG), y0.1");
         assert_eq!(method(Variant::Prior(Algorithm::Dmc, Mode::Published), "", None).title, "DmC (published)");

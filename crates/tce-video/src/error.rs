@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 /// Any reason for which there is no video.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The user interrupted it.
+    /// The user asked to stop.
     #[error(transparent)]
-    Sim(#[from] tce_sim::SimError),
+    Interrupted(#[from] tce_base::Interrupted),
     /// A file could not be written.
     #[error(transparent)]
     File(#[from] tce_base::FileError),

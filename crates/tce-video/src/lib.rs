@@ -7,8 +7,7 @@ mod mp4;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
-use tce_base::{AtomicFile, FileError, Progress, interrupted};
-use tce_sim::SimError;
+use tce_base::{AtomicFile, FileError, Interrupted, Progress, interrupted};
 use tce_sim::video::{Picture, Video};
 
 pub use error::{Error, Result};
@@ -100,7 +99,7 @@ impl VideoWriter {
 fn draw(video: &Video, progress: &Progress, mut take: impl FnMut(Vec<Picture>) -> Result<()>) -> Result<()> {
     for start in (0..video.frames()).step_by(BATCH) {
         if interrupted() {
-            return Err(SimError::Interrupted.into());
+            return Err(Interrupted::nothing_kept().into());
         }
         let frames = start..(start + BATCH).min(video.frames());
         let count = frames.len() as u64;

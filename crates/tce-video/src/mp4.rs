@@ -4,8 +4,7 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use tce_base::{FileError, Progress, interrupted};
-use tce_sim::SimError;
+use tce_base::{FileError, Interrupted, Progress, interrupted};
 use tce_sim::video::Video;
 
 use crate::error::{Error, Result};
@@ -79,7 +78,7 @@ impl Ffmpeg {
         let complaints = reader.join().unwrap_or_default();
         if interrupted() && !status.success() {
             // Ctrl-C reaches ffmpeg as well, which may have gone first.
-            return Err(SimError::Interrupted.into());
+            return Err(Interrupted::nothing_kept().into());
         }
         if !status.success() {
             let why = complaints.trim();

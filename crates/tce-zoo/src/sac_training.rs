@@ -30,7 +30,7 @@ use tce_learn::{Buffer, Learner, Meter, Policy, PolicyKind, PolicyLearner};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::{EPISODE_LIMIT, Env};
 
-use crate::actors::{Arena, Evaluation, evaluate, load_policy};
+use crate::actors::{Actions, Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::exhibits::{Card, Exhibit};
 
@@ -498,7 +498,7 @@ impl Training {
         let arena = Arena::new(agent, shift, ScoreTable::default());
         let streams = Streams::new(seed ^ self.ledger.step);
         // To its end even when the user interrupts: the checkpoint that follows needs it.
-        let evaluation = evaluate(&policy, arena, episodes, streams, false, || false)?;
+        let evaluation = evaluate(&policy, arena, episodes, streams, Actions::Sampled, || false)?;
         let summary = summarise(&evaluation, self.ledger.step);
         let metrics: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
         let metrics = metrics.iter().map(|(name, value)| (name.as_str(), *value));

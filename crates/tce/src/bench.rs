@@ -14,7 +14,7 @@ use tce_data::{
     Agent, NeighbourOptions, Rows, Shift, Standardizer, Transitions, TransportOptions, nn_distances, transport_costs,
 };
 use tce_diffusion::{
-    Denoiser, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, TrainConfig, Trainer,
+    Balance, Denoiser, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, TrainConfig, Trainer,
     uniform_labels,
 };
 use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
@@ -145,7 +145,7 @@ pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Meas
     let mut before = product_rate(PROBE);
     for _ in 0..repeats {
         if tce_base::interrupted() {
-            return Err(tce_run::error::Error::Interrupted);
+            return Err(tce_run::error::Error::interrupted());
         }
         let started = Instant::now();
         let mut calls = 0u32;
@@ -239,10 +239,10 @@ fn jobs<L>(on: &On, seeds: u64, job: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec
 }
 
 fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
-    let config = IqlConfig { regulariser: kind, ..IqlConfig::default() };
+    let config = IqlConfig { regulariser: kind, ..IqlConfig::paper() };
     let small = RegulariserConfig {
-        cvae: CvaeConfig { hidden: vec![64], steps: 10, ..CvaeConfig::default() },
-        ..Default::default()
+        cvae: CvaeConfig { hidden: vec![64], steps: 10, ..CvaeConfig::paper() },
+        ..RegulariserConfig::paper()
     };
     let device = &on.device;
     let job = |members| {
@@ -325,7 +325,7 @@ fn meta_dt(On { device, .. }: &On, world: bool) -> Body {
 }
 
 fn cvae(On { device, .. }: &On) -> Body {
-    let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::default() };
+    let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::paper() };
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(config.batch).expect("target rows");
     let learner = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", device).expect("defaults");
     let latent = config.latent_per_action * ACT;
@@ -336,7 +336,7 @@ fn cvae(On { device, .. }: &On) -> Body {
 }
 
 fn labels(On { device, .. }: &On) -> Body {
-    let config = LabelConfig::default();
+    let config = LabelConfig::paper();
     let all = members(1);
     let models = LabelModels::new(&all, &config, device).expect("defaults");
     let buffer = Buffer::new(all, BATCH).expect("good data").target_only(config.batch).expect("target rows");
@@ -367,7 +367,7 @@ fn score_train(On { device, .. }: &On) -> Body {
     let spec = NetworkConfig::new(OBS, 1);
     // Both live as long as the process: the training data borrows them.
     let [source, target] = [table(2, 200_000), table(1, 5_000)].map(|t| &*Box::leak(Box::new(t)));
-    let data = ScoreData::labelled(&source.observations, &target.observations, OBS, true).expect("rows");
+    let data = ScoreData::labelled(&source.observations, &target.observations, OBS, Balance::Parts).expect("rows");
     let mut trainer = trainer(device, spec);
     let batch = TrainConfig::default().batch as f64;
     let inputs = (2 * spec.embedding + spec.dims * spec.width) as f64;

@@ -2,7 +2,6 @@
 //! crates.
 
 // An error ends the command: nobody waits for its copy.
-#![allow(clippy::result_large_err)]
 
 pub mod allocator;
 mod bench;

@@ -393,7 +393,7 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
     let policies = ["one", "two"]
         .map(|out| fs::read(dir.path().join(out).join("walker2d-morph_medium-to-expert/policy.safetensors")).unwrap());
     assert!(policies[0] == policies[1] && one["verdict"]["tried"].as_array().unwrap().len() == 1);
-    let stages = common::files(&dir.path().join("one/stages"));
+    let stages = files(&dir.path().join("one/stages"));
     let cycles = |name: &str| {
         let names = stages.iter().filter_map(|p| p.file_name()?.to_str());
         let mut steps: Vec<u64> =

@@ -19,7 +19,7 @@ fn data(trajectories: &[(usize, f32, End)], seed: u64) -> Transitions {
         for i in 0..rows {
             let r = reward * ((i + 1) as f32 / 50.0).min(1.0) * rng.random_range(0.98f32..1.02);
             let last = i + 1 == rows;
-            t.push(&[0.0], &[0.0], r, &[0.0], last && end == End::Fall, last && end == End::Limit);
+            t.push(&[0.0], &[0.0], r, &[0.0], last && end == Fall, last && end == Limit);
         }
     }
     t

@@ -137,7 +137,7 @@ impl Default for BosaConfig {
             ensemble: 5,
             samples: 1,
             std: 0.125f64.sqrt(),
-            cvae: CvaeConfig { hidden: vec![256, 256], steps: 5000, batch: 256, ..CvaeConfig::default() },
+            cvae: CvaeConfig { hidden: vec![256, 256], steps: 5000, batch: 256, ..CvaeConfig::paper() },
             discount: 0.99,
             delay: DelayConfig::default(),
             critic_lr: 3e-4,

@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_modes_differ_in_two_things_only() {
-        let (base, regulariser) = (IqlConfig::default(), RegulariserConfig::default());
+        let (base, regulariser) = (IqlConfig::paper(), RegulariserConfig::paper());
         let config = |mode| DmcConfig { mode, ..DmcConfig::default() };
         let (published, corrected) = (config(Mode::Published), config(Mode::Corrected));
         let (a, b) = (published.backbone(&base), corrected.backbone(&base));

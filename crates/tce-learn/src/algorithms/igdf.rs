@@ -308,7 +308,7 @@ mod tests {
         let shaped = |mode| {
             let small = IgdfConfig { hidden: vec![8], features: 4, steps: 3, batch: 4, ..IgdfConfig::default() };
             let config = IgdfConfig { mode, code: Code::Authors, ..small };
-            let iql = IqlConfig { hidden: vec![8], ..IqlConfig::default() };
+            let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
             let igdf = Igdf::new(&buffer, &config, &iql, Regulariser::None, 1, Place::NONE, &cpu());
             let mut igdf = igdf.unwrap().unwrap();
             let (batch, weights) = igdf.transform.transform(&igdf.iql, &batch, 3, &mut Meter::default());

@@ -185,7 +185,7 @@ mod tests {
 
     #[test]
     fn the_modes_differ_in_policy_extraction_alone() {
-        let iql = IqlConfig::default();
+        let iql = IqlConfig::paper();
         let of = |mode| OtdfConfig { mode, ..OtdfConfig::default() }.backbone(&iql);
         let (published, corrected) = (of(Mode::Published), of(Mode::Corrected));
         assert_eq!(published.policy_extraction, PolicyExtraction::MeanWeight);

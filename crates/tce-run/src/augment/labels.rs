@@ -10,7 +10,7 @@ use tce_learn::{LabelConfig, LabelErrors, LabelModels, Learner};
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::Result;
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
 /// The inverse dynamics and reward models of a whole population: trained on the target rows, or taken from their stage.
@@ -29,7 +29,7 @@ pub fn label_models(
     }
     let learn_terminals = terminals(inputs, config) == Terminal::Learned;
     let labels = LabelConfig { learn_terminals, ..config.training.clone() };
-    let spec = Spec { inputs: inputs.spec(learn_terminals), seeds, labels: &labels };
+    let spec = Spec { inputs: inputs.spec(Domains::with_source(learn_terminals)), seeds, labels: &labels };
     tce_base::begin_step("label models");
     let stage = Stage::open(root, "stages/labels", &spec, device)?;
     let source = inputs.source.as_ref().filter(|_| learn_terminals).map(|s| Arc::new(s.rows.clone()));

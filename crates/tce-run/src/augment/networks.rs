@@ -12,7 +12,7 @@ use tce_nn::Device;
 use super::labels::label_models;
 use crate::config::Config;
 use crate::error::Result;
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::kept::{Kept, cycle_file};
 use crate::stage::Stage;
 
@@ -56,7 +56,7 @@ pub fn networks(
         Length::Steps(_) => None,
     };
     let spec = Spec {
-        inputs: inputs.spec_imitated(g.source_states, &config.target),
+        inputs: inputs.spec_imitated(Domains::with_source(g.source_states), &config.target),
         labels: action_models.as_ref().map(|(_, stage, _)| stage.name()),
         seeds,
         process: g.process,

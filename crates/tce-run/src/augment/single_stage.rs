@@ -17,7 +17,7 @@ use tce_nn::{Device, NamedParameters, cpu};
 use super::augmentation::{Augmentation, Generated};
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::kept::Kept;
 use crate::stage::Stage;
 
@@ -32,7 +32,8 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
         options: &'a DensityOptions,
     }
     let file = "scores.safetensors";
-    let stage = Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
+    let stage =
+        Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(Domains::Both), options }, &cpu())?;
     if let Some(scale) = stage.summary::<DensityScale>()? {
         let path = stage.file(file);
         let mut loaded = NamedParameters::load(&path)?;
@@ -80,7 +81,7 @@ fn train(
         scores: Option<&'a DensityOptions>,
     }
     let spec = Spec {
-        inputs: inputs.spec(scored.is_some()),
+        inputs: inputs.spec(Domains::with_source(scored.is_some())),
         seeds,
         kind,
         rows: if scored.is_some() { "source" } else { "target" },

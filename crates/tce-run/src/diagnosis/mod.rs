@@ -26,7 +26,7 @@ use crate::augment::{finisher, label_models, networks};
 use crate::config::{Config, GeneratedRows};
 use crate::course::Course;
 use crate::error::{Error, Result};
-use crate::inputs::Inputs;
+use crate::inputs::{Domains, Inputs};
 use crate::stage::Stage;
 
 pub mod cycles;
@@ -115,7 +115,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         version: VERSION,
         of: &subject.of,
         task: subject.task,
-        inputs: inputs.spec(true),
+        inputs: inputs.spec(Domains::Both),
         config: used,
         seeds,
         seed,

@@ -127,7 +127,7 @@ fn abundant_rewards(
     };
     let labels = LabelConfig { learn_terminals: false, ..config.labels.training.clone() };
     let trained = train_labels(&[member], &labels, &mut attempt.checkpoints("abundant-labels")?, device)?;
-    trained.ok_or(Error::Interrupted)
+    trained.ok_or_else(Error::interrupted)
 }
 
 /// V of IQL on target and generated rows, and these rows.
@@ -154,7 +154,7 @@ fn value_function(
     let mut checkpoints = attempt.checkpoints("value")?;
     let outcome = train(&mut value, &rows, steps, "value", &mut checkpoints, device, |_, _| Ok::<_, Error>(()))?;
     match outcome.interrupted {
-        true => Err(Error::Interrupted),
+        true => Err(Error::interrupted()),
         false => Ok((value, rows)),
     }
 }
@@ -207,7 +207,7 @@ impl Models {
         let count = members.len();
         let mut checkpoints = attempt.checkpoints("transition-models")?;
         let transition = train_transition_models(members, &options.transition, &mut checkpoints, device)?;
-        let transition = transition.ok_or(Error::Interrupted)?;
+        let transition = transition.ok_or_else(Error::interrupted)?;
 
         let rewards = match &abundant {
             None => None,

@@ -154,7 +154,7 @@ fn stop(running: BTreeMap<usize, Child>) -> Error {
     for (_, mut child) in running {
         let _ = child.wait();
     }
-    Error::Interrupted
+    Error::interrupted()
 }
 
 #[cfg(unix)]

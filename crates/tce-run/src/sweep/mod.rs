@@ -31,6 +31,7 @@ pub mod status;
 pub mod work;
 
 pub use manifest::{Description, Entry, Files, Header, Kind, Manifest, Override};
+pub use repair::Check;
 
 /// The list of work in a sweep's folder.
 const MANIFEST: &str = "manifest.jsonl";

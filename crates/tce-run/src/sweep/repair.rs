@@ -11,23 +11,34 @@ use super::work::{Failure, Outcome, now};
 use super::{Entry, Kind, Sweep};
 use crate::error::{Error, Result};
 
+/// What is looked at of files that are there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Check {
+    /// Whether they exist.
+    Existence,
+    /// Their hashes, too.
+    Content,
+}
+
 impl Sweep {
-    /// Takes back what is done and no longer whole, and tells what it was. Whether files exist is always looked at, their content if
-    /// `thorough`.
+    /// Takes back what is done and no longer whole, and tells what it was. `check` says what is looked at.
     ///
     /// # Errors
-    /// If a folder cannot be written; if `thorough`, and a user's own file changed since the sweep was planned.
-    pub fn take_back_damaged(&self, thorough: bool) -> Result<Vec<String>> {
+    /// If a folder cannot be written; with [`Check::Content`], if a user's own file changed since the sweep was planned.
+    pub fn take_back_damaged(&self, check: Check) -> Result<Vec<String>> {
         let mut taken = Vec::new();
         for entry in self.entries() {
             // What was made of the planned file is whole; another file is another sweep.
-            if let Some(change) = self.changed_input(entry).filter(|_| thorough) {
+            if let Some(change) = self.changed_input(entry).filter(|_| check == Check::Content) {
                 return Err(Error::Failed(change));
             }
             let why = match self.outcome(entry) {
                 Ok(None) => continue,
                 Ok(Some(outcome)) => {
-                    let damage = if thorough { self.damage(entry, &outcome) } else { self.lost(&outcome) };
+                    let damage = match check {
+                        Check::Content => self.damage(entry, &outcome),
+                        Check::Existence => self.lost(&outcome),
+                    };
                     let Some(why) = damage else { continue };
                     // A record that is another piece's has that piece's files.
                     if outcome.id == entry.id {

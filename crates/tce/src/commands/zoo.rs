@@ -9,7 +9,7 @@ use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
 use tce_run::error::{Error, Result};
-use tce_zoo::actors::{Arena, Evaluation, evaluate};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 use tce_zoo::exhibits::{Card, Exhibit};
 
 use crate::output::{Output, table};
@@ -211,7 +211,7 @@ impl Rollout {
 
 fn evaluate_card(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
     let arena = Arena::new(card.agent, card.shift, ScoreTable::default());
-    Ok(evaluate(policy, arena, episodes, streams, mean, interrupted)?)
+    Ok(evaluate(policy, arena, episodes, streams, Actions::mean_if(mean), interrupted)?)
 }
 
 impl Keep {

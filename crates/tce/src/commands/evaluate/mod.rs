@@ -12,7 +12,7 @@ use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_run::error::{Error, Result};
 #[cfg(feature = "video")]
 use tce_zoo::actors::evaluate_recorded;
-use tce_zoo::actors::{Arena, Evaluation, evaluate, load_policy};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate, load_policy};
 
 use crate::output::{Output, mark_best, table};
 
@@ -66,7 +66,14 @@ impl Evaluate {
         if let Some(writer) = writer {
             let roll = |arena, episodes| {
                 let streams = Streams::new(self.seed);
-                Ok(evaluate_recorded(&policies[0], arena, episodes, streams, !self.sample, interrupted)?)
+                Ok(evaluate_recorded(
+                    &policies[0],
+                    arena,
+                    episodes,
+                    streams,
+                    Actions::mean_if(!self.sample),
+                    interrupted,
+                )?)
             };
             let (evaluation, video) = self.video.record(writer, arena, roll, self.episodes)?;
             let environment = format!("{agent}-{shift}");
@@ -77,7 +84,8 @@ impl Evaluate {
         let mut all = Vec::new();
         for (path, policy) in self.policies.iter().zip(&policies) {
             let streams = Streams::new(self.seed);
-            let evaluation = evaluate(policy, arena, self.episodes, streams, !self.sample, interrupted)?;
+            let evaluation =
+                evaluate(policy, arena, self.episodes, streams, Actions::mean_if(!self.sample), interrupted)?;
             all.push(Evaluated {
                 policy: path.clone(),
                 environment: format!("{agent}-{shift}"),

@@ -58,7 +58,7 @@ pub struct Shown {
 /// An error of `tce-video` as one of the command.
 fn as_ours(error: tce_video::Error) -> Error {
     match error {
-        tce_video::Error::Sim(error) => Error::Sim(error),
+        tce_video::Error::Interrupted(reason) => reason.into(),
         tce_video::Error::File(error) => Error::File(error),
         tce_video::Error::Failed(text) => Error::Failed(text),
         tce_video::Error::Missing { path, what } => Error::Missing { path, what },

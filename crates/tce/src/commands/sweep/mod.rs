@@ -12,7 +12,7 @@ use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
 use tce_run::sweep::local::Share;
 use tce_run::sweep::slurm::{Array, Submission};
-use tce_run::sweep::{Kind, Manifest, Sweep};
+use tce_run::sweep::{Check, Kind, Manifest, Sweep};
 
 use crate::output::{Output, fit, table};
 
@@ -195,7 +195,7 @@ impl Launch {
         }
         let sweep = Sweep::open(&self.directory)?;
         if !self.dry_run {
-            for what in sweep.take_back_damaged(self.verify)? {
+            for what in sweep.take_back_damaged(if self.verify { Check::Content } else { Check::Existence })? {
                 tce_base::note!("to be done again: {what}");
             }
         }
@@ -306,7 +306,7 @@ impl StatusArgs {
             let until = std::time::Instant::now() + Duration::from_secs_f64(self.every.clamp(0.1, 3600.0));
             while std::time::Instant::now() < until {
                 if interrupted() {
-                    return Err(Error::Interrupted);
+                    return Err(Error::interrupted());
                 }
                 std::thread::sleep(Duration::from_millis(50));
             }
