@@ -1,4 +1,4 @@
-//! Training of score networks, for a given length or until it no longer helps, and what is held out to tell.
+//! Training of score networks, for a given length or until a criterion on held-out rows no longer falls.
 
 use tce_base::random::choose;
 use tce_base::{Progress, Streams};
@@ -32,7 +32,7 @@ pub(crate) struct Ready {
     pub model: ScoreModel,
     /// Last reported loss, per member.
     pub loss: Vec<f32>,
-    /// What decided at the ends of the cycles; empty where the length was given.
+    /// The criterion at the ends of the cycles; empty where the length was given.
     pub curve: Vec<CycleEnd>,
 }
 

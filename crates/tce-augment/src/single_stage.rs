@@ -131,7 +131,7 @@ pub struct ScoreUnits {
 }
 
 impl ScoreUnits {
-    /// The range of `scores`.
+    /// Mean and spread of `scores`.
     pub fn fit(scores: &[f32]) -> Self {
         let units = Standardizer::fit(scores, 1);
         Self { mean: units.mean[0], std: units.std[0] }
@@ -163,7 +163,7 @@ fn draw_scores(scores: &[f32], uniform: &[f32]) -> Vec<f32> {
     uniform.iter().map(|u| scores[(u * scores.len() as f32) as usize]).collect()
 }
 
-/// What training the network leaves behind besides it.
+/// The results of training the network, besides it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
     /// The maps between rows and transitions.

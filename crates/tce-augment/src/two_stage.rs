@@ -30,7 +30,7 @@ pub struct Generator {
     pub transition: ScoreModel,
 }
 
-/// What training the networks leaves behind.
+/// The results of training the networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
     /// The maps.
@@ -52,7 +52,7 @@ pub struct Trained {
 /// How rows are drawn.
 #[derive(Clone, Copy)]
 pub struct Draw<'a> {
-    /// By what steps.
+    /// The sampler.
     pub sampler: &'a Sampler,
     /// The members' random streams.
     pub members: &'a [Streams],
@@ -193,7 +193,7 @@ impl Generator {
     }
 }
 
-/// What the two networks are trained on, in their units, and the rows that tell when to stop, which neither of them sees.
+/// Training data of the two networks, in their units, and the held-out rows that decide when to stop.
 struct Tables {
     /// Live dimensions.
     dims: usize,

@@ -1,10 +1,10 @@
-//! What a fit needs besides data and settings: seeds, a device, and somebody who keeps checkpoints and metrics.
+//! The inputs of a fit besides data and settings: seeds, a device, and where checkpoints and metrics are stored.
 
 use tce_base::{FileError, Streams};
 use tce_diffusion::{Chunks, DiffusionError, ScoreModel};
 use tce_nn::{Checkpoints, Device, cpu};
 
-/// Who keeps what a fit has done so far, so that it can be resumed and looked at. Nothing is kept unless a method says so.
+/// Stores checkpoints, metrics and samples of a fit. The default methods store nothing.
 pub trait Keeper: Sync {
     /// The checkpoints of the training `name`.
     ///
@@ -51,14 +51,14 @@ pub struct Nothing;
 
 impl Keeper for Nothing {}
 
-/// Who computes for whom.
+/// Members, device and storage of a fit.
 #[derive(Clone, Copy)]
 pub struct Work<'a> {
     /// The members of the population, one policy or data set each; member i equals a fit of seed i alone.
     pub seeds: &'a [u64],
     /// What computes the networks.
     pub device: &'a Device,
-    /// Who keeps checkpoints and metrics.
+    /// Storage of checkpoints and metrics.
     pub keeper: &'a dyn Keeper,
 }
 

@@ -1,5 +1,5 @@
-//! What every crate of the workspace stands on: named random streams, files that are never half-written, and long
-//! work that shows its progress and can be interrupted.
+//! The base of all crates: named random streams, files that are whole or absent, and long work that shows its progress and can be
+//! interrupted.
 
 pub mod course;
 pub mod files;

@@ -9,7 +9,7 @@
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
 //! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
-//! | prior methods: TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
+//! | prior methods, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
 //! | choosing among a batch's rows | [`selection`] |
 //! | DmC: scored rows, filtered and weighed | [`dmc`] |
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |

@@ -1,6 +1,6 @@
-//! The configuration of a run, typed. What a field's comment says is what `tce config show KEY` tells a user ([`crate::keys`]): a sentence on
-//! what the key does, and behind `Source:` where its value is from, if it is the same for every preset. Why a preset has a value is told
-//! beside the value, in `presets/`; where a value comes from, by [`crate::layers`].
+//! The typed configuration of a run. The doc comment of a field is the text of `tce config show KEY` ([`crate::keys`]): one sentence on
+//! what the key does, and after `Source:` the origin of its value, if all presets share it. The reason for a preset's value is a comment
+//! in `presets/`. [`crate::layers`] records which layer set a value.
 
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};

@@ -1,4 +1,4 @@
-//! What a fit keeps in the attempt at a stage: checkpoints, metrics, sampled chunks and the networks at the ends of cycles.
+//! Stores the products of a fit in the attempt at a stage: checkpoints, metrics, sampled chunks and the networks at the ends of cycles.
 
 use std::sync::{Mutex, PoisonError};
 

@@ -1,6 +1,6 @@
-//! Where a configuration comes from: layers of TOML, each value remembered with the layer it comes from.
+//! Layers of TOML that make a configuration. Each value is stored with the layer that set it.
 //!
-//! Layers, the later winning: the `default` preset (which lists every key), the chosen preset, the paper's task-specific
+//! Layers, from the lowest to the highest: the `default` preset (which lists every key), the chosen preset, the paper's task-specific
 //! values (preset `paper` only), the variant, the user's file, `--set key=value`. A table with a `kind` (a process, a
 //! sampler) is one value: another kind replaces it whole.
 
@@ -30,7 +30,7 @@ const QUICK: &str = include_str!("../presets/quick.toml");
 pub enum Preset {
     /// Appendix B and Tables C.4, C.5 as written.
     Paper,
-    /// What measures best with one setting for all tasks.
+    /// The settings that measure best, the same for all tasks.
     #[default]
     Default,
     /// `default`, sized to finish in minutes on two cores.
@@ -200,7 +200,7 @@ pub(crate) fn with_current_names(table: &mut Table) {
     }
 }
 
-/// `learner.steps=1000` as a table; what is no TOML value is a string.
+/// `learner.steps=1000` as a table; a value that is not TOML is a string.
 fn parse_set(set: &str) -> Result<Table> {
     let (key, value) = set.split_once('=').ok_or_else(|| Error::Usage(format!("--set {set}: expected key=value")))?;
     let value = format!("v = {value}").parse::<Table>().ok().and_then(|mut t| t.remove("v"));
@@ -315,7 +315,7 @@ impl ConfigArgs {
         own
     }
 
-    /// Whether nothing was said.
+    /// Whether no argument was given.
     pub fn is_empty(&self) -> bool {
         self.preset == Preset::default() && self.config.is_none() && self.sets.is_empty()
     }

@@ -53,7 +53,7 @@ pub fn save_policies(policies: &[Policy], seeds: &[u64], directory: &Path, input
     policies.iter().zip(seeds).map(save).collect()
 }
 
-/// What learning leaves behind besides the policies.
+/// The results of a training besides the policies.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
     /// Evaluation of the last checkpoint, per member; empty without a simulator.
@@ -63,7 +63,7 @@ pub struct Learned {
     pub metrics: BTreeMap<String, Vec<Option<f64>>>,
     /// Seconds of training.
     pub seconds: f64,
-    /// What computed it.
+    /// The device that computed it.
     #[serde(default)]
     pub device: DeviceKind,
 }
@@ -76,7 +76,7 @@ impl Learned {
 }
 
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
-/// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a word that stands for all that decides the result. `keep` gets the policies before they are evaluated, so that what hours of training gave is on disk
+/// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a cache key: the hash of all inputs. `keep` gets the policies before they are evaluated, so that what hours of training gave is on disk
 /// whatever happens then.
 pub fn learn(
     data: Vec<MemberData>,
@@ -107,13 +107,13 @@ pub fn learn(
     let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
-    // What was trained before the first step is told whole at every start.
+    // Metrics of preparations are written again at every start.
     let before = journal.take();
     let before = before.iter().flat_map(|(job, training, report)| lines(training, report, job * size)).collect();
     let metrics = &mut Metrics::resume_behind(directory, before, |stage, at| {
         at <= from && ["learn", "evaluate"].contains(&stage)
     })?;
-    // The number of the last evaluation, which came with the last report.
+    // The last evaluation came with the last report.
     let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
     let mut evaluated = vec![number(from - from % steps.report_every); jobs.len()];
     let outcome = train_side_by_side(&mut jobs, steps, &label, &mut checkpoints, device, |k, report, learner| {
@@ -206,7 +206,7 @@ fn evaluate_all(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Aren
         .zip(seeds)
         .map(|(p, &seed)| {
             match evaluate(p, arena, episodes, Streams::new(seed), Actions::Mean, interrupted) {
-                // One member that has diverged must not cost the others their result.
+                // If one member has diverged, the others keep their results.
                 Err(tce_zoo::Error::Sim(e @ SimError::NotFinite { .. })) => {
                     tce_base::note!("seed {seed}: {e}; it has no score");
                     Ok(Evaluation::failed(e.to_string()))

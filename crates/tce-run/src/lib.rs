@@ -1,4 +1,16 @@
-//! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
+//! Runs: configuration, presets and variants, stages with their files, the pipeline, verdicts, diagnoses and sweeps.
+//!
+//! | question | module |
+//! |---|---|
+//! | Which settings are there, and where does a value come from? | [`config`], [`layers`], [`keys`], [`variant`] |
+//! | Which learners are there? | [`learners`] |
+//! | What is stored, and when is work done? | [`stage`], [`kept`] |
+//! | A whole run of the benchmark? | [`pipeline`] |
+//! | A training on own tables? | [`training_run`] |
+//! | Generated rows? | [`augment`], [`mixture`] |
+//! | Which policy is best, without a simulator? | [`off_policy_evaluation`], [`verdict`] |
+//! | Can generated rows be trusted? | [`diagnosis`] |
+//! | Many runs? | [`sweep`], [`study`] |
 
 pub mod augment;
 pub mod config;

@@ -25,8 +25,8 @@ pub fn build(
     config.own().build(&on)?.ok_or_else(Error::interrupted)
 }
 
-/// The number of every row of `others` that the learner of `config` chooses by, the greater the closer to the target; None if it
-/// chooses by none that is computed before.
+/// One score per row of `others`, for learners that choose rows by scores; a higher score is closer to the target. None for other
+/// learners.
 ///
 /// # Errors
 /// If there are too few rows, or the user interrupts it.
@@ -43,7 +43,7 @@ pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -
     })
 }
 
-/// -cost: the greater the closer.
+/// Costs as scores: higher is closer.
 pub fn negated_costs(costs: Vec<f32>) -> Arc<Vec<f32>> {
     Arc::new(costs.into_iter().map(|c| -c).collect())
 }

@@ -81,7 +81,7 @@ struct DistanceSpec {
     kind: SourceRows,
 }
 
-/// One number per source row, the smaller the closer to the target; computed once per pair of data sets.
+/// One distance per source row to the target; computed once per pair of data sets.
 pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f32>> {
     Ok(distances_stage(inputs, kind, root)?.0)
 }

@@ -1,13 +1,14 @@
-//! Which of several policies to put on the robot, told from the two data sets alone.
+//! Off-policy evaluation: estimates of policies from the two data sets alone, without a simulator.
 //!
 //! A policy is tried in a learned model of the target's dynamics ([`tce_learn::dynamics`]: both domains' rows, the domain as an
 //! input). An imagined episode begins at a target state, keeps to one network of the ensemble, and ends where the network says that
 //! the state is terminal, where the state has left everything that either robot has been seen in, or after as many steps as the longest
 //! target episode has.
 //!
-//! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks say anything. What
-//! it does after that is worth the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early must not pay.
-//! Halting where the data end is MOReL's (Kidambi et al. 2020). It is shown and decides nothing: on HalfCheetah, kinematic, policies of 686,
+//! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks are
+//! not to be trusted. Each later step counts the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early
+//! must not pay.
+//! Halting where the data end is MOReL's (Kidambi et al. 2020). It is shown only and decides nothing: on HalfCheetah, kinematic, policies of 686,
 //! 3130 and 3766 have 926, 1985 and 906 (bench/expansion.md).
 //!
 //! | metric | meaning |
@@ -49,7 +50,7 @@ const WORST: f64 = 0.01;
 /// A state further outside of everything seen than this share of a column's range ends an imagined episode.
 const MARGIN: f32 = 0.25;
 
-/// The trained ensemble, and how it does on target rows that it has not seen.
+/// The trained ensemble, with its errors on target rows that it has not seen.
 pub struct OffPolicyEvaluator {
     /// The ensemble.
     pub dynamics: Dynamics,
@@ -66,11 +67,11 @@ pub struct OffPolicyEvaluator {
     /// The units of the policies' actions, where they are not the box.
     actions: Option<ActionRange>,
     spacing: f64,
-    /// The reward of a step that nobody knows anything of.
+    /// The reward of a step outside of the models' range.
     worst: f64,
 }
 
-/// What a policy does in the learned model.
+/// The estimates of a policy in the learned model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OffPolicyEstimate {
     /// Mean return of the imagined episodes.
@@ -158,7 +159,7 @@ impl OffPolicyEvaluator {
         self.held_out.get((last * quantile) as usize).copied().unwrap_or(f64::NAN)
     }
 
-    /// Tries a policy.
+    /// Evaluates a policy in the learned model.
     pub fn evaluate(&self, policy: &Policy) -> Result<OffPolicyEstimate> {
         let t = &self.target;
         let starts = starts(t);
@@ -268,7 +269,7 @@ impl OffPolicyEvaluator {
         actions
     }
 
-    /// What the policies are worth by fitted Q evaluation on the target's rows, as one stage.
+    /// Estimates the policies' values by fitted Q evaluation on the target's rows, as one stage.
     ///
     /// # Errors
     /// If a file cannot be read or written, or the user interrupts.

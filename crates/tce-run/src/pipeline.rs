@@ -1,4 +1,4 @@
-//! One variant on one pair of data sets, from rows to scores, in a directory that holds everything about it.
+//! A run: one variant on one pair of data sets, from rows to scores, in one directory.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -40,9 +40,9 @@ pub struct Summary {
     pub extra_rows: usize,
     /// The generated rows, per member; empty if there are none.
     pub generated: Vec<Generated>,
-    /// Seconds from data to scores, without stages that were there already.
+    /// Seconds from data to scores, without stages that were finished before.
     pub seconds: f64,
-    /// Where everything is.
+    /// The directory of the run.
     pub directory: PathBuf,
     /// The files of the target's and the source's rows, if it had any, as they were called at the time.
     #[serde(default)]
@@ -56,7 +56,7 @@ impl Summary {
     }
 }
 
-/// What decides a run's result: what a variant does not use is left out, so that baselines are shared between presets.
+/// The inputs of a run's key. Settings that the variant does not use are left out, so that presets share baselines.
 #[derive(Serialize)]
 struct RunSpec<'a> {
     inputs: InputSpec,
@@ -212,7 +212,7 @@ pub fn run(
         directory: stage.directory().to_owned(),
         data: inputs.files(),
     };
-    // Without times, so that two copies of a run have the same bytes.
+    // No times: two copies of a run have the same bytes.
     let result = "result.json".to_owned();
     write_json(
         &attempt.file(&result),
@@ -225,7 +225,7 @@ pub fn run(
 
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
-    // Who models the dynamics has no use for a terminal row without a successor.
+    // Models of the dynamics cannot use a terminal row without a successor.
     let target = match config.learner.algorithm.about().successors {
         true => inputs.imitated(&config.target),
         false => inputs.learned_from(&config.target),
@@ -233,7 +233,7 @@ fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds
     let target = Arc::new(target.into_owned());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
-        // Generated rows among them are no trajectories.
+        // Generated rows are no trajectories.
         let generated = config.mixture.generated != GeneratedRows::None;
         trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
     }

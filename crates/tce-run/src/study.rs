@@ -49,6 +49,19 @@ fn method(variant: Variant, label: &str, config: Option<&Config>) -> Method {
     }
 }
 
+/// A column of runs that the user gave a `name`.
+fn named(id: &str, name: &str) -> Method {
+    Method {
+        id: id.to_owned(),
+        title: id.to_owned(),
+        variant: name.to_owned(),
+        base: name.to_owned(),
+        published: false,
+        baseline: false,
+        plain: false,
+    }
+}
+
 /// Baselines first, and all four of them: a table without a baseline shows that it lacks it.
 fn in_order(mut methods: Vec<Method>) -> Vec<Method> {
     for baseline in Variant::BASELINES {
@@ -255,15 +268,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         methods.push(match Variant::from_str(name, false) {
             Ok(variant) => Method { id: id.clone(), ..method(variant, label, config.as_ref()) },
             // A name of the user's own.
-            Err(_) => Method {
-                id: id.clone(),
-                title: id.clone(),
-                variant: name.clone(),
-                base: name.clone(),
-                published: false,
-                baseline: false,
-                plain: false,
-            },
+            Err(_) => named(id, name),
         });
     }
     let methods = in_order(methods);

@@ -1,4 +1,4 @@
-//! Which policy is recommended, told from the two data sets alone ([`crate::off_policy_evaluation`]), and how sure that is.
+//! Recommends a policy from the two data sets alone ([`crate::off_policy_evaluation`]), and says how sure that is.
 //!
 //! Every policy is tried from the same target states in the same learned models, so that two policies are compared episode by
 //! episode. The rule, measured in bench/expansion.md:
@@ -8,8 +8,8 @@
 //!    the paired differences and by more than [`LEAST`] of the standard's return. Of several, the one with the highest return.
 //! 3. Of several seeds of the recommended method, the one with the highest imagined return is taken.
 //!
-//! Learned dynamics err, and a policy that leaves the data errs with them: where the difference is within what the models cannot
-//! tell, the baseline stands.
+//! Learned dynamics have errors, above all away from the data. If the difference is smaller than what they can resolve, the baseline
+//! is recommended.
 
 use std::path::{Path, PathBuf};
 
@@ -33,13 +33,13 @@ pub const FILE: &str = "policy.safetensors";
 pub struct Candidate {
     /// The method's name in tables.
     pub name: String,
-    /// Whether it is a baseline: no more than the target rows, no generated ones.
+    /// Whether it is a baseline: it learned from target rows alone.
     pub baseline: bool,
     /// The policies' files.
     pub files: Vec<PathBuf>,
 }
 
-/// What was found of a candidate.
+/// The estimates of a candidate.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tried {
     /// The method's name.

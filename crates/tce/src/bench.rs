@@ -4,7 +4,7 @@
 //! machine that others slow down shows it. FLOPs are those of the matrix products, two per multiply-add; what is not a
 //! product (activations, Adam, batches) counts as time but not as work.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -53,8 +53,23 @@ impl Body {
     }
 }
 
-/// Name, what it is, and how to set it up.
-type Workload = (&'static str, &'static str, fn(&On) -> Body);
+/// What is measured.
+#[derive(Clone, Copy)]
+enum Work {
+    /// Updates of a learner of the registry.
+    Method(Algorithm),
+    /// Steps of an environment.
+    Environment(Agent),
+    /// What a function sets up.
+    Own(fn(&On) -> Body),
+}
+
+/// A workload of the table.
+struct Workload {
+    name: String,
+    title: String,
+    work: Work,
+}
 
 /// What a workload runs on.
 pub struct On {
@@ -64,19 +79,14 @@ pub struct On {
     pub seeds: u64,
 }
 
-/// Every workload, in the order of the table.
-const WORKLOADS: &[Workload] = &[
+/// Name, title and how to set it up.
+type Own = (&'static str, &'static str, fn(&On) -> Body);
+
+/// What stands before the learners of the registry and the environments.
+const OWN: &[Own] = &[
     ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", |on| iql(on, on.seeds, RegulariserKind::None)),
     ("iql-5", "the same, five seeds side by side (members' updates)", |on| iql(on, 5, RegulariserKind::None)),
     ("iql-kl", "IQL with the forward-KL term of Eq. 10", |on| iql(on, on.seeds, RegulariserKind::ForwardKl)),
-    ("dara", "DARA, the same sizes", |on| method(on, Algorithm::Dara)),
-    ("bosa", "BOSA", |on| method(on, Algorithm::Bosa)),
-    ("srpo", "SRPO", |on| method(on, Algorithm::Srpo)),
-    ("igdf", "IGDF", |on| method(on, Algorithm::Igdf)),
-    ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", |on| method(on, Algorithm::Otdf)),
-    ("dmc", "DmC's learner", |on| method(on, Algorithm::Dmc)),
-    ("td3-bc", "TD3+BC", |on| method(on, Algorithm::Td3Bc)),
-    ("rebrac", "ReBRAC", |on| method(on, Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
     ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", |on| meta_dt(on, false)),
@@ -90,29 +100,44 @@ const WORKLOADS: &[Workload] = &[
     ("cvae", "behaviour CVAE, 256-256, 128 rows", cvae),
     ("nearest", "nearest of 5 000 target rows, 40 dimensions (Eq. 9)", |_| nearest()),
     ("transport", "Sinkhorn costs to 5 000 target rows, blocks of 2 500", |_| transport()),
-    ("env-halfcheetah", "environment steps", |_| environment(Agent::HalfCheetah)),
-    ("env-hopper", "environment steps", |_| environment(Agent::Hopper)),
-    ("env-walker2d", "environment steps", |_| environment(Agent::Walker2d)),
-    ("env-ant", "environment steps", |_| environment(Agent::Ant)),
 ];
+
+/// Every workload, in the order of the table.
+fn workloads() -> Vec<Workload> {
+    let own =
+        |&(name, title, make): &Own| Workload { name: name.to_owned(), title: title.to_owned(), work: Work::Own(make) };
+    // These have workloads of their own.
+    let apart = [Algorithm::Iql, Algorithm::Bc, Algorithm::MetaDt];
+    let methods = Algorithm::ALL.iter().filter(|a| !apart.contains(a)).map(|&algorithm| {
+        let about = algorithm.about();
+        Workload { name: about.name.to_owned(), title: about.title.to_owned(), work: Work::Method(algorithm) }
+    });
+    let environments = Agent::ALL.into_iter().map(|agent| Workload {
+        name: format!("env-{agent}"),
+        title: "environment steps".to_owned(),
+        work: Work::Environment(agent),
+    });
+    OWN.iter().map(own).chain(methods).chain(environments).collect()
+}
 
 /// The names of all workloads.
 pub fn names() -> impl Iterator<Item = &'static str> {
-    WORKLOADS.iter().map(|w| w.0)
+    static NAMES: LazyLock<Vec<String>> = LazyLock::new(|| workloads().into_iter().map(|w| w.name).collect());
+    NAMES.iter().map(String::as_str)
 }
 
 /// Whether the workload `name` needs the simulator.
 pub fn simulates(name: &str) -> bool {
-    name.starts_with("env-")
+    workloads().iter().any(|w| w.name == name && matches!(w.work, Work::Environment(_)))
 }
 
 /// How a workload did.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {
     /// Its name.
-    pub name: &'static str,
+    pub name: String,
     /// What it is.
-    pub title: &'static str,
+    pub title: String,
     /// What is counted.
     pub unit: &'static str,
     /// Units per second, median of the repeats.
@@ -132,8 +157,13 @@ pub struct Measured {
 /// # Panics
 /// If there is no such workload ([`names`]).
 pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Measured> {
-    let &(name, title, make) = WORKLOADS.iter().find(|w| w.0 == name).expect("a known workload");
-    let mut body = make(on);
+    let known = workloads().into_iter().find(|w| w.name == name);
+    let Workload { name, title, work } = known.expect("a known workload");
+    let mut body = match work {
+        Work::Method(algorithm) => method(on, algorithm),
+        Work::Environment(agent) => environment(agent),
+        Work::Own(make) => make(on),
+    };
     let mut call = || {
         (body.call)();
         // A GPU works behind the program's back.

@@ -155,7 +155,7 @@ fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
     eprintln!("{ends} runs came to their end");
 }
 
-/// What BOSA, IGDF and Meta-DT train before their first step is gone on with too.
+/// What BOSA, IGDF and Meta-DT train before their first step is resumed too.
 #[test]
 fn prior_methods_killed_anywhere_learn_the_same() {
     let dir = tempfile::tempdir().unwrap();
@@ -323,7 +323,7 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
     let refuse = |what: &str| {
         let other = tce(dir.path(), &[&args("whole")[..], &["--set=learner.steps=700"]].concat());
         assert_eq!(other.status.code(), Some(2));
-        let expected = format!("found {what} learning with other settings, seeds or files");
+        let expected = format!("found {what} training run with other settings, seeds or files");
         assert!(message(&other).contains(&expected), "{}", message(&other));
     };
     refuse("the results of");

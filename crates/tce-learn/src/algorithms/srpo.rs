@@ -16,7 +16,7 @@
 //! | - | `mode` | corrected | published: x is the logit D(s) itself |
 //!
 //! IGDF's authors stand it on another IQL (Gaussian log-likelihood for the policy: `learner.iql.policy_extraction = "awr_logprob"`); here all
-//! rivals stand on the same one.
+//! prior methods stand on the same one.
 //!
 //! **Published**: the logit is clamped where the odds are meant. Every state with D(s) ≤ .1 (odds below 1.1) then loses λ ln 10,
 //! however unlike it is, and ln of a logit grows hardly at all.

@@ -12,7 +12,7 @@ use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, o
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
 
-/// Losses and other metrics are taken every so many steps: they cost time, and their means need no more. A prime, because what a
+/// Metrics are computed every so many steps: more would cost time and not change their means. A prime, because what a
 /// method does at every second step is to be seen too.
 const METER_EVERY: u64 = 11;
 /// Steps of a job before the next one's turn.

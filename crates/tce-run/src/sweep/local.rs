@@ -14,7 +14,7 @@ use super::{Entry, Sweep};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 
-/// Time between two looks at how long the rest takes.
+/// Time between two estimates of the time left.
 const LOOK: Duration = Duration::from_secs(3);
 
 /// How to share the machine.
@@ -33,8 +33,8 @@ pub struct Share {
 }
 
 impl Sweep {
-    /// Does what is missing, and returns how many pieces of work are not done in the end. Work that was interrupted or killed goes on from
-    /// its checkpoint; pieces that others need come first.
+    /// Does unfinished work, and returns how many pieces are unfinished at the end. Interrupted work resumes from its checkpoint;
+    /// pieces that others need come first.
     ///
     /// # Errors
     /// If a process cannot be started, or the user interrupts; the processes are then given the time to write their checkpoints.
@@ -135,7 +135,7 @@ impl Sweep {
     }
 }
 
-/// What is under way of all pieces of work, and how long the rest takes, where that is known.
+/// Which pieces of work are running, and the time left, where it is known.
 fn headline_of(done: usize, running: usize, all: usize, left: Option<f64>) -> String {
     let pieces = match running {
         0 | 1 => format!("piece {}", (done + running).max(1)),

@@ -1,4 +1,4 @@
-//! The immutable list of work that a description is turned into.
+//! The list of work of a sweep, which is made once from its description and does not change.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -15,9 +15,9 @@ use crate::inputs::{DataArgs, ensure_data};
 use crate::layers::{Layered, Preset};
 use crate::variant::Variant;
 
-/// More runs than anybody has machines for are a slip of the finger.
+/// More runs than this are taken for a typing error.
 const MOST_RUNS: u64 = 100_000;
-/// Changes when manifests of before cannot be read.
+/// Version of the format. Increase it when older manifests cannot be read.
 const FORMAT: u32 = 1;
 
 /// A sweep's description, `sweep.toml`: tasks × variants × overrides × seeds.
@@ -51,7 +51,7 @@ pub struct Description {
     /// Data files of a task, relative to the description.
     #[serde(default)]
     pub data: BTreeMap<Task, Files>,
-    /// Further settings, each one more column; none means one column without a name.
+    /// Further settings, one column each; empty: one column without a name.
     #[serde(default)]
     pub overrides: Vec<Override>,
 }
@@ -66,7 +66,7 @@ pub struct Files {
     pub target: Option<PathBuf>,
 }
 
-/// A column of its own.
+/// A further column of the table.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Override {
@@ -108,7 +108,7 @@ pub enum Kind {
 pub struct Entry {
     /// Its place in the manifest.
     pub index: usize,
-    /// Hash of all that decides its outcome.
+    /// Cache key: hash of all inputs of its result.
     pub id: String,
     /// What it is.
     pub kind: Kind,
@@ -124,7 +124,7 @@ pub struct Entry {
     pub seed: u64,
     /// Hash of its configuration.
     pub config: String,
-    /// Indices of the work that should be done before. Without it the work is done all the same, only twice.
+    /// Indices of work that should be done before. If it is not, this piece does it itself.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<usize>,
 }
@@ -150,7 +150,7 @@ impl fmt::Display for Entry {
     }
 }
 
-/// What holds for all pieces of work.
+/// The part of a manifest that all pieces of work share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header {
@@ -183,7 +183,7 @@ impl Header {
 /// The list of work of a sweep.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Manifest {
-    /// What holds for all of it.
+    /// The shared part.
     pub header: Header,
     /// The work.
     pub entries: Vec<Entry>,
@@ -418,7 +418,7 @@ impl Manifest {
     }
 }
 
-/// The tasks that patterns stand for, in the order of the patterns.
+/// The tasks that match the patterns, in the order of the patterns.
 fn tasks(patterns: &[String]) -> Result<Vec<Task>, String> {
     let mut out: Vec<Task> = Vec::new();
     for pattern in patterns {

@@ -1,6 +1,6 @@
-//! Work that counts as done and whose files are gone or changed: it is taken back, and done again by the next launch.
+//! Finished work whose files are missing or changed. It is marked as unfinished, and the next launch does it again.
 //!
-//! Nothing is removed. The record and the files get names that nobody looks for (`.NAME.damaged-N`), beside where they were.
+//! Nothing is removed. The record and the files are renamed to `.NAME.damaged-N`.
 
 use std::fs;
 use std::path::Path;
@@ -21,7 +21,7 @@ pub enum Check {
 }
 
 impl Sweep {
-    /// Takes back what is done and no longer whole, and tells what it was. `check` says what is looked at.
+    /// Marks damaged work as unfinished, and describes it. `check` says what is looked at.
     ///
     /// # Errors
     /// If a folder cannot be written; with [`Check::Content`], if a user's own file changed since the sweep was planned.

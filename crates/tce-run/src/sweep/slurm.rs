@@ -1,8 +1,8 @@
-//! A sweep on a cluster that runs Slurm: array jobs of what is missing.
+//! A sweep on a Slurm cluster: array jobs of unfinished work.
 //!
-//! Job numbers are notes only, and `sacct` is not needed: a launch submits what is not done and, as far as `squeue` tells, not
-//! submitted already. Should the queue forget a job, or a node be given up for dead whose processes live on, another launch or a second
-//! copy of the work does no harm (see [`super::work`]).
+//! Job numbers are notes only, and `sacct` is not needed: a launch submits work that is neither finished nor, according to
+//! `squeue`, submitted. If the queue loses a job, or a node that was given up still runs, another launch does no harm: two copies of
+//! the same work are allowed (see [`super::work`]).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -73,8 +73,8 @@ fn call(program: &str, arguments: &[String]) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// The batch script. It waits for the work instead of becoming it: of a batch script that is killed Slurm tells nothing but its
-/// death, and the warning before the time limit goes to the script alone.
+/// The batch script. It starts the work as a child and waits for it: Slurm sends the warning before the time limit to the script
+/// alone, and reports nothing of a script that is killed.
 fn script(sweep: &Path, list: &Path, program: &Path, options: &Submission) -> String {
     let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', r"'\''"));
     format!(

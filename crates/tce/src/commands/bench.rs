@@ -142,7 +142,7 @@ fn render(report: &Report) -> String {
         // The CPU's rate is no measure of a GPU.
         let share = if report.device == DeviceKind::Cpu { format!("{:.0} %", 100.0 * m.share) } else { "-".into() };
         [
-            m.name.to_owned(),
+            m.name.clone(),
             format!("{} {}/s", number(m.per_second), m.unit),
             format!("{} .. {}", number(m.range[0]), number(m.range[1])),
             products(format!("{:.1}", m.gflops)),
