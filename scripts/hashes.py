@@ -30,8 +30,8 @@ SMALL = """
 source.rows=1500 target.rows=600 generator.state_steps=40 generator.transition_steps=40 generator.rows=600 generator.sampler.steps=4
 labels.training.steps=40 learner.steps=30 learner.behaviour.cvae.steps=20 learner.behaviour.cvae.hidden=[32] learner.behaviour.samples=3
 learner.bosa.cvae.steps=5 learner.bosa.cvae.hidden=[16] learner.igdf.steps=5 learner.meta_dt.world_model.steps=5
-learner.meta_dt.embed=16 learner.meta_dt.batch=16 evaluation.episodes=1 joint.steps=30 joint.rows=600 joint.sampler.steps=4 joint.width=32
-joint.scores.reference=500 dynamics.steps=20
+learner.meta_dt.embed=16 learner.meta_dt.batch=16 evaluation.episodes=1 single_stage.steps=30 single_stage.rows=600 single_stage.sampler.steps=4 single_stage.width=32
+single_stage.scores.reference=500 dynamics.steps=20
 """.split()
 
 
@@ -59,10 +59,10 @@ def main():
 def run_everything(tce, folder):
     """Leaves a folder of results for every command that makes any."""
     small = [f"--set={s}" for s in SMALL]
-    run = ["run", TASK, "--preset", "quick", "--from-zoo", "--no-floors"]
+    run = ["run", TASK, "--preset", "quick", "--from-zoo", "--no-baselines"]
     for variant in choices(tce("run", "--help"), "--variant"):
         tce(*run, "--no-verdict", "--variant", variant, "--out", "runs", *small)
-    # Two seeds, floors, a verdict, lengths and filters that no variant has by itself.
+    # Two seeds, baselines, a verdict, lengths and filters that no variant has by itself.
     tce("run", TASK, "--preset", "quick", "--from-zoo", "--seeds", "2", "--out", "verdict", *small)
     auto = ["generator.until_done.first=20", "generator.until_done.state_limit=60", "generator.until_done.transition_limit=60"]
     auto += ["generator.state_steps=auto", "generator.transition_steps=auto", "filter.enabled=true", "filter.by=consistency"]

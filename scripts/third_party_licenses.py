@@ -89,7 +89,7 @@ def main():
     if not licences:
         sys.exit(f"{wheel}: found no mujoco-*.dist-info/licenses, expected MuJoCo's wheel, unpacked")
     parts += [f.read_text(encoding="utf-8", errors="replace").strip() for f in licences]
-    parts.append(f"{RULE}\nThe letters in films, by the crate noto-sans-mono-bitmap (OFL-1.1)\n{RULE}")
+    parts.append(f"{RULE}\nThe letters in videos, by the crate noto-sans-mono-bitmap (OFL-1.1)\n{RULE}")
     parts.append((ROOT / "scripts/licenses/noto-sans-mono.txt").read_text().strip())
     for text, names in users.values():
         parts.append(f"{RULE}\n" + "\n".join(names) + f"\n{RULE}\n\n{text}")

@@ -27,7 +27,7 @@ def training_run(run: TrainingRun) -> str:
     header = ["policy", "imagined return", "± standard error", "survived", "fitted Q", "action error"]
     rows = [
         [
-            t["name"] + (" (baseline)" if t["floor"] else ""),
+            t["name"] + (" (baseline)" if t["baseline"] else ""),
             _number(t["imagined_return"]),
             _number(t["standard_error"]),
             f"{100 * t['survival']:.0f} %",
@@ -46,7 +46,7 @@ def benchmark_run(run: BenchmarkRun) -> str:
     for row in run.rows:
         values = [score for score in row["scores"] if score is not None]
         mean = sum(values) / len(values) if values else None
-        name = row["title"] + (" (baseline)" if row["floor"] else "")
+        name = row["title"] + (" (baseline)" if row["baseline"] else "")
         rows.append([name, _number(mean), str(len(row["seeds"])), f"{row['seconds']:.0f} s"])
     said = "".join(f"<p>{escape(sentence)}</p>" for sentence in run.conclusion)
     return f"<h4>{escape(run.task)}</h4>{_table(['method', 'score', 'seeds', 'time'], rows)}{said}"

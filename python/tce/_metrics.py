@@ -54,8 +54,8 @@ class MetricsReader:
         place = {step: k for k, step in enumerate(steps)}
         out: dict[str, npt.NDArray[np.float64]] = {"step": np.array(steps, float)}
         for line in lines:
-            figures = {name: value for name, value in line.items() if name not in ("stage", "step", "member")}
-            for name, value in figures.items():
+            metrics = {name: value for name, value in line.items() if name not in ("stage", "step", "member")}
+            for name, value in metrics.items():
                 column = out.setdefault(name, np.full((members, len(steps)), np.nan))
                 column[line["member"], place[line["step"]]] = np.nan if value is None else value
         return out

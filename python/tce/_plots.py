@@ -63,7 +63,7 @@ def scores(rows: list[dict[str, Any]], ax: Any = None) -> Any:
     ax = _axes(ax, (5.5, 0.5 + 0.4 * max(1, len(rows))))
     for k, row in enumerate(rows):
         values = [score for score in row["scores"] if score is not None]
-        colour = COLOURS[2] if row["floor"] else COLOURS[0]
+        colour = COLOURS[2] if row["baseline"] else COLOURS[0]
         if values:
             ax.barh(k, np.mean(values), color=colour, alpha=0.6)
             ax.plot(values, [k] * len(values), "o", color=colour, ms=4)

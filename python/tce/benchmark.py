@@ -62,7 +62,7 @@ class BenchmarkRun:
 
         return pd.DataFrame(
             [
-                {"method": row["title"], "variant": row["variant"], "baseline": row["floor"], "seed": seed, "score": score}
+                {"method": row["title"], "variant": row["variant"], "baseline": row["baseline"], "seed": seed, "score": score}
                 for row in self.rows
                 for seed, score in zip(row["seeds"], row["scores"])
             ]
@@ -123,7 +123,7 @@ def run(
         arguments += ["--config", str(settings.config)]
     for key in settings.sets:
         arguments += ["--set", key]
-    arguments += [] if baselines else ["--no-floors"]
+    arguments += [] if baselines else ["--no-baselines"]
     arguments += [] if verdict else ["--no-verdict"]
     return BenchmarkRun(command(*arguments, progress=progress))
 

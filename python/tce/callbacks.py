@@ -1,6 +1,6 @@
 """Metrics for trackers: ``tce.train(..., callback=tce.callbacks.wandb(project="arm"))``.
 
-Every line of metrics is a dict with ``stage``, ``step`` and ``member`` (the seeds in their order, from 0), and figures. TensorBoard files
+Every line of metrics is a dict with ``stage``, ``step`` and ``member`` (the seeds in their order, from 0), and numbers. TensorBoard files
 are written in any case: ``OUT/tensorboard``.
 """
 
@@ -12,10 +12,10 @@ from typing import Any
 __all__ = ["mlflow", "wandb"]
 
 
-def _figures(line: dict[str, Any]) -> dict[str, float]:
+def _numbers(line: dict[str, Any]) -> dict[str, float]:
     prefix = f"seed{line['member']}/{line['stage']}"
-    figures = {key: value for key, value in line.items() if key not in ("stage", "step", "member")}
-    return {f"{prefix}/{key}": value for key, value in figures.items() if isinstance(value, (int, float))}
+    metrics = {key: value for key, value in line.items() if key not in ("stage", "step", "member")}
+    return {f"{prefix}/{key}": value for key, value in metrics.items() if isinstance(value, (int, float))}
 
 
 def wandb(run: Any = None, **options: Any) -> Callable[[dict[str, Any]], None]:
@@ -33,13 +33,13 @@ def wandb(run: Any = None, **options: Any) -> Callable[[dict[str, Any]], None]:
     known: set[str] = set()
 
     def call(line: dict[str, Any]) -> None:
-        figures = _figures(line)
+        metrics = _numbers(line)
         # Stages count their own steps: each figure has an axis of its own stage.
         axis = f"seed{line['member']}/{line['stage']}/step"
-        for name in figures.keys() - known:
+        for name in metrics.keys() - known:
             run.define_metric(name, step_metric=axis)
-        known.update(figures)
-        run.log({**figures, axis: line["step"]})
+        known.update(metrics)
+        run.log({**metrics, axis: line["step"]})
 
     return call
 
@@ -53,7 +53,7 @@ def mlflow(**options: Any) -> Callable[[dict[str, Any]], None]:
 
     def call(line: dict[str, Any]) -> None:
         # MLflow takes no slash at the beginning and no `*`.
-        figures = {name.replace("*", "star"): value for name, value in _figures(line).items()}
-        package.log_metrics(figures, step=line["step"])
+        metrics = {name.replace("*", "star"): value for name, value in _numbers(line).items()}
+        package.log_metrics(metrics, step=line["step"])
 
     return call

@@ -21,7 +21,7 @@ from .augmentation import Augmented
 from .policy import Policy
 from .transitions import Source, Transitions, load
 
-#: Gets every line of metrics: a mapping with ``stage``, ``step``, ``member`` and the figures.
+#: Gets every line of metrics: a mapping with ``stage``, ``step``, ``member`` and the numbers.
 Callback = Callable[[dict[str, Any]], None]
 
 #: What :func:`train` takes as extra rows.
@@ -60,7 +60,7 @@ class TrainingRun:
 
     @cached_property
     def metrics(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Figures of the training by name, shape (seeds, reports); ``"step"`` has the updates, shape (reports,)."""
+        """Metrics of the training by name, shape (seeds, reports); ``"step"`` has the updates, shape (reports,)."""
         return MetricsReader(self.out / "metrics.jsonl").arrays("learn")
 
     @property
@@ -69,7 +69,7 @@ class TrainingRun:
         return [evaluation.get("score") for evaluation in self.summary["evaluations"]]
 
     def plot(self, *names: str, ax: Any = None) -> Any:
-        """Curves of the figures `names` (all losses by default) over the updates. Needs ``matplotlib``. Returns the axes."""
+        """Curves of the metrics `names` (all losses by default) over the updates. Needs ``matplotlib``. Returns the axes."""
         from ._plots import curves
 
         return curves(self.metrics, names, ax)

@@ -221,4 +221,4 @@ def test_results_show_themselves(source, target, wider):
     assert run.plot().lines
     assert run.verdict["reason"] in run._repr_html_() and "imagined return" in run._repr_html_()
     pytest.importorskip("pandas")
-    assert list(run.to_frame()["floor"]) == [True, False]
+    assert list(run.to_frame()["baseline"]) == [True, False]

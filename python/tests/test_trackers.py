@@ -39,6 +39,6 @@ def test_lines_are_plain(target):
     lines: list[dict] = []
     tce.train(target, config=TINY, compare=False, callback=lines.append)
     assert lines and json.dumps(lines)
-    from tce.callbacks import _figures
+    from tce.callbacks import _numbers
 
-    assert all(name.startswith("seed0/learn/") for line in lines for name in _figures(line))
+    assert all(name.startswith("seed0/learn/") for line in lines for name in _numbers(line))

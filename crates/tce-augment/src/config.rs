@@ -82,7 +82,7 @@ pub enum Length {
 }
 
 impl Serialize for Length {
-    fn serialize<S: serde::Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {
             Length::Steps(steps) => to.serialize_u64(*steps),
             Length::Auto => to.serialize_str("auto"),
@@ -101,21 +101,21 @@ impl schemars::JsonSchema for Length {
 }
 
 impl<'de> Deserialize<'de> for Length {
-    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<Self, D::Error> {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Visitor;
         impl serde::de::Visitor<'_> for Visitor {
             type Value = Length;
             fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
                 f.write_str("a number of updates, or \"auto\"")
             }
-            fn visit_u64<E>(self, steps: u64) -> std::result::Result<Length, E> {
+            fn visit_u64<E>(self, steps: u64) -> Result<Length, E> {
                 Ok(Length::Steps(steps))
             }
-            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> std::result::Result<Length, E> {
+            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> Result<Length, E> {
                 let negative = |_| E::invalid_value(serde::de::Unexpected::Signed(steps), &self);
                 u64::try_from(steps).map(Length::Steps).map_err(negative)
             }
-            fn visit_str<E: serde::de::Error>(self, word: &str) -> std::result::Result<Length, E> {
+            fn visit_str<E: serde::de::Error>(self, word: &str) -> Result<Length, E> {
                 match word {
                     "auto" => Ok(Length::Auto),
                     _ => Err(E::invalid_value(serde::de::Unexpected::Str(word), &self)),
@@ -232,7 +232,7 @@ pub struct LabelsConfig {
 impl LabelsConfig {
     /// What measures best with one setting for all tasks: the values of the preset `default`.
     pub fn recommended() -> Self {
-        Self { terminal: Terminal::Rule, training: LabelConfig { steps: 20_000, ..LabelConfig::default() } }
+        Self { terminal: Terminal::Rule, training: LabelConfig { steps: 20_000, ..LabelConfig::paper() } }
     }
 
     /// Where terminal flags come from, for a robot whose rule is known or not, and data with or without terminal rows: a rule only where
@@ -262,26 +262,26 @@ pub enum Terminal {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SingleStageConfig {
-    /// The noise process of the joint network, chosen by its `kind`.
+    /// The noise process of the single-stage network, chosen by its `kind`.
     pub process: Process,
-    /// How rows are drawn from the joint network, chosen by its `kind`.
+    /// How rows are drawn from the single-stage network, chosen by its `kind`.
     pub sampler: Sampler,
     /// What stands in a generated row for s': s' itself, or its difference from s. Source: SynthER and DmC have the next state.
     pub target: Target,
-    /// Width of the joint network's layers. Source: SynthER, DmC: 2048.
+    /// Width of the single-stage network's layers. Source: SynthER, DmC: 2048.
     #[schemars(range(min = 1))]
     pub width: usize,
     /// Width of the embedding of the noise level.
     #[schemars(range(min = 1))]
     pub embedding: usize,
-    /// Residual blocks of the joint network. Source: SynthER, DmC: 6.
+    /// Residual blocks of the single-stage network. Source: SynthER, DmC: 6.
     pub blocks: usize,
-    /// Training steps of the joint network. Source: SynthER, DmC: 100 000.
+    /// Training steps of the single-stage network. Source: SynthER, DmC: 100 000.
     pub steps: u64,
-    /// Rows per step of the joint network. Source: SynthER, DmC: 1024, 256 for small data.
+    /// Rows per step of the single-stage network. Source: SynthER, DmC: 1024, 256 for small data.
     #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Learning rate of the joint network at the beginning. Source: SynthER, DmC: 3e-4.
+    /// Learning rate of the single-stage network at the beginning. Source: SynthER, DmC: 3e-4.
     pub learning_rate: f64,
     /// The learning rate over the steps.
     pub schedule: Schedule,

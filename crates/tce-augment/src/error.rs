@@ -19,8 +19,8 @@ pub enum Error {
     #[error("{0}")]
     Failed(String),
     /// The user asked to stop.
-    #[error("interrupted; what was finished is kept where there are checkpoints")]
-    Interrupted,
+    #[error(transparent)]
+    Interrupted(#[from] tce_base::Interrupted),
 }
 
 /// The result of what this crate does.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use tce_base::Streams;
+use tce_base::{Interrupted, Streams};
 use tce_data::{Rows, Standardizer, Transitions, zscore_keep};
 use tce_learn::{LabelConfig, LabelModels, Labelled, Member, TerminalHandling, train_labels};
 use tce_nn::{Checkpoints, Device};
@@ -35,7 +35,7 @@ pub fn fit_labels(
     checkpoints: &mut Checkpoints,
     device: &Device,
 ) -> Result<LabelModels> {
-    train_labels(members, config, checkpoints, device)?.ok_or(Error::Interrupted)
+    train_labels(members, config, checkpoints, device)?.ok_or_else(|| Interrupted::resumable().into())
 }
 
 /// A robot's own rule: whether a state ends an episode.

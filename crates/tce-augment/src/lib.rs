@@ -7,7 +7,7 @@
 //! | One network over whole transitions (SynthER, DmC)? | [`single_stage`] |
 //! | The filter and the labels of state pairs? | [`finish`] |
 //! | Source and generated rows in one table? | [`mixture`] |
-//! | Checkpoints, figures, chunks on disk? | the caller's: [`work::Keeper`] |
+//! | Checkpoints, metrics, chunks on disk? | the caller's: [`work::Keeper`] |
 //!
 //! ```
 //! use tce_augment::config::Length;

@@ -1,4 +1,4 @@
-//! Training of score networks, for a given length or until it no longer helps, and what is held out to tell.
+//! Training of score networks, for a given length or until a criterion on held-out rows no longer falls.
 
 use tce_base::random::choose;
 use tce_base::{Progress, Streams};
@@ -9,20 +9,20 @@ use crate::config::{GeneratorConfig, Length};
 use crate::error::Result;
 use crate::work::Keeper;
 
-/// Figures of a network at the end of a cycle, one number per member each. The first one decides when the training is done; the less
+/// Metrics of a network at the end of a cycle, one number per member each. The first one decides when the training is done; the less
 /// the better.
-pub(crate) type Figures = Vec<(&'static str, Vec<f64>)>;
+pub(crate) type Metrics = Vec<(&'static str, Vec<f64>)>;
 
 /// How long a network is trained.
 pub(crate) enum Course<'a> {
     /// So many updates.
     Steps(u64),
-    /// Until the first of its figures no longer falls.
+    /// Until the first of its metrics no longer falls.
     UntilDone {
         /// The cycles.
         plan: UntilDone,
         /// Measures the network.
-        judge: &'a (dyn Fn(&Trainer) -> Result<Figures> + Sync),
+        criterion: &'a (dyn Fn(&Trainer) -> Result<Metrics> + Sync),
     },
 }
 
@@ -32,7 +32,7 @@ pub(crate) struct Ready {
     pub model: ScoreModel,
     /// Last reported loss, per member.
     pub loss: Vec<f32>,
-    /// What decided at the ends of the cycles; empty where the length was given.
+    /// The criterion at the ends of the cycles; empty where the length was given.
     pub curve: Vec<CycleEnd>,
 }
 
@@ -46,7 +46,7 @@ pub(crate) fn run(
     name: &str,
 ) -> Result<Ready> {
     let data = std::slice::from_ref(data);
-    let log = |step: u64, figure: &'static str, values: &[f64]| keeper.record(name, step, figure, values);
+    let log = |step: u64, metric: &'static str, values: &[f64]| keeper.record(name, step, metric, values);
     let mut loss = Vec::new();
     let end = match course {
         Course::Steps(steps) => Some(*steps),
@@ -63,14 +63,14 @@ pub(crate) fn run(
             trainer.train(data, *steps, checkpoints, on_loss)?;
             (trainer.model(), Vec::new())
         }
-        Course::UntilDone { plan, judge } => {
-            let judge = |trainer: &Trainer| -> Result<Vec<f64>> {
-                let figures = judge(trainer)?;
-                figures.iter().for_each(|(figure, values)| log(trainer.steps(), figure, values));
+        Course::UntilDone { plan, criterion } => {
+            let at_cycle_end = |trainer: &Trainer| -> Result<Vec<f64>> {
+                let metrics = criterion(trainer)?;
+                metrics.iter().for_each(|(metric, values)| log(trainer.steps(), metric, values));
                 keeper.cycle(name, trainer.steps(), &trainer.model())?;
-                Ok(figures.into_iter().next().map(|(_, values)| values).unwrap_or_default())
+                Ok(metrics.into_iter().next().map(|(_, values)| values).unwrap_or_default())
             };
-            trainer.train_until_done(data, plan, checkpoints, on_loss, judge)?
+            trainer.train_until_done(data, plan, checkpoints, on_loss, at_cycle_end)?
         }
     };
     Ok(Ready { model, loss, curve })

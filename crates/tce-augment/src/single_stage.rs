@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{DensityOptions, DensityScale, Rows, Standardizer, Transitions, further_scores};
 use tce_diffusion::{
-    Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
+    Balance, Condition, NetworkConfig, Part, Request, ScoreData, ScoreModel, Target, TrainConfig, Trainer, present,
     uniform_labels,
 };
 
@@ -131,6 +131,7 @@ pub struct ScoreUnits {
 }
 
 impl ScoreUnits {
+    /// Mean and spread of `scores`.
     pub fn fit(scores: &[f32]) -> Self {
         let units = Standardizer::fit(scores, 1);
         Self { mean: units.mean[0], std: units.std[0] }
@@ -162,7 +163,7 @@ fn draw_scores(scores: &[f32], uniform: &[f32]) -> Vec<f32> {
     uniform.iter().map(|u| scores[(u * scores.len() as f32) as usize]).collect()
 }
 
-/// What training the network leaves behind besides it.
+/// The results of training the network, besides it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
     /// The maps between rows and transitions.
@@ -208,11 +209,16 @@ impl SingleStage {
         });
         let data = match &on {
             // No condition at all is the one that DmC's network learns beside the others.
-            None => {
-                ScoreData::new(vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }], d, c, false)?
+            None => ScoreData::new(
+                vec![Part { rows: &rows, condition: Condition::Constant(vec![0.0; c]) }],
+                d,
+                c,
+                Balance::Rows,
+            )?,
+            Some((_, on)) => {
+                ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, Balance::Rows)?
+                    .with_dropout(config.guidance.dropout)?
             }
-            Some((_, on)) => ScoreData::new(vec![Part { rows: &rows, condition: Condition::Rows(on) }], d, c, false)?
-                .with_dropout(config.guidance.dropout)?,
         };
         let SingleStageConfig { width, embedding, blocks, process, steps, .. } = *config;
         let network = NetworkConfig { width, embedding, blocks, ..NetworkConfig::new(d, c) };
@@ -261,7 +267,7 @@ impl SingleStage {
             let (rows, kept, outside_box) = units.decode(rows);
             if rows.is_empty() {
                 return Err(Error::Failed(format!(
-                    "seed {}: none of {n} generated rows is finite; lower joint.learning_rate, or look for huge values in the data",
+                    "seed {}: none of {n} generated rows is finite; lower single_stage.learning_rate, or look for huge values in the data",
                     work.seeds[m]
                 )));
             }
@@ -314,7 +320,7 @@ pub fn enough_to_score(others: usize, target: usize, options: &DensityOptions) -
     for (what, rows) in [("other", others), ("target", target)] {
         if rows < options.neighbour {
             return Err(Error::Failed(format!(
-                "joint.scores: found {rows} {what} rows, expected at least joint.scores.neighbour = {}; lower it, or give more rows",
+                "single_stage.scores: found {rows} {what} rows, expected at least single_stage.scores.neighbour = {}; lower it, or give more rows",
                 options.neighbour
             )));
         }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::Streams;
 use tce_data::{Support, Transitions};
 use tce_diffusion::{
-    Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel,
+    Balance, Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel,
     TrainConfig, Trainer, uniform_labels,
 };
 use tce_learn::{LabelModels, rmse};
@@ -16,7 +16,7 @@ use tce_nn::is_cpu;
 
 use crate::config::{GeneratorConfig, Length};
 use crate::error::{Error, Result};
-use crate::score_training::{Course, Figures, Ready, held_out_rows, progress, run, start_rows};
+use crate::score_training::{Course, Metrics, Ready, held_out_rows, progress, run, start_rows};
 use crate::units::Units;
 use crate::work::Work;
 
@@ -30,7 +30,7 @@ pub struct Generator {
     pub transition: ScoreModel,
 }
 
-/// What training the networks leaves behind.
+/// The results of training the networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
     /// The maps.
@@ -52,7 +52,7 @@ pub struct Trained {
 /// How rows are drawn.
 #[derive(Clone, Copy)]
 pub struct Draw<'a> {
-    /// By what steps.
+    /// The sampler.
     pub sampler: &'a Sampler,
     /// The members' random streams.
     pub members: &'a [Streams],
@@ -94,23 +94,24 @@ impl Generator {
         let (state_data, transition_data, held_out) = (tables.state()?, tables.transition()?, tables.held_out()?);
         let [held_out_state, held_out_transition] = [0, 1].map(|k| held_out.as_ref().map(|data| &data[k]));
         let members = work.streams();
-        let judge_states = |trainer: &Trainer| losses(trainer, held_out_state, &state_data);
+        let state_losses = |trainer: &Trainer| losses(trainer, held_out_state, &state_data);
         // What a learner will see are actions, so that they decide: the held-out loss of q_tran rises long before they are right.
-        let judge_successors = |trainer: &Trainer| -> Result<Figures> {
-            let labels = labels.ok_or_else(|| Error::Failed("q_tran cannot be judged without label models".into()))?;
+        let successor_losses = |trainer: &Trainer| -> Result<Metrics> {
+            let labels =
+                labels.ok_or_else(|| Error::Failed("q_tran cannot be measured without label models".into()))?;
             let draw = Draw::new(&config.sampler, &members, target);
             let errors = implied_errors(&units, &trainer.model(), labels, &tables.held_out, &draw)?;
-            let mut figures = vec![("implied_action_error", errors)];
-            figures.extend(losses(trainer, held_out_transition, &transition_data)?);
-            Ok(figures)
+            let mut metrics = vec![("implied_action_error", errors)];
+            metrics.extend(losses(trainer, held_out_transition, &transition_data)?);
+            Ok(metrics)
         };
         let state_course = match config.state_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.state(), judge: &judge_states },
+            Length::Auto => Course::UntilDone { plan: config.until_done.state(), criterion: &state_losses },
         };
         let transition_course = match config.transition_steps {
             Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.transition(), judge: &judge_successors },
+            Length::Auto => Course::UntilDone { plan: config.until_done.transition(), criterion: &successor_losses },
         };
         let (state, transition) =
             train_both([&state_data, &transition_data], [&state_course, &transition_course], config, work)?;
@@ -192,11 +193,11 @@ impl Generator {
     }
 }
 
-/// What the two networks are trained on, in their units, and the rows that tell when to stop, which neither of them sees.
+/// Training data of the two networks, in their units, and the held-out rows that decide when to stop.
 struct Tables {
     /// Live dimensions.
     dims: usize,
-    balanced: bool,
+    balance: Balance,
     /// `[rows, dims]`; None where q_mix sees target states alone.
     source_states: Option<Vec<f32>>,
     states: Vec<f32>,
@@ -216,7 +217,7 @@ impl Tables {
         let (states, outputs) = (units.states(&target.observations), units.outputs(target));
         Self {
             dims,
-            balanced: config.balanced,
+            balance: if config.balanced { Balance::Parts } else { Balance::Rows },
             source_states: source.map(|t| units.states(&t.observations)),
             states: pick(&states, &kept),
             outputs: pick(&outputs, &kept),
@@ -229,7 +230,7 @@ impl Tables {
     /// Of q_mix: the label says whose state it is (Eq. 5).
     fn state(&self) -> Result<ScoreData<'_>> {
         Ok(match &self.source_states {
-            Some(source) => ScoreData::labelled(source, &self.states, self.dims, self.balanced)?,
+            Some(source) => ScoreData::labelled(source, &self.states, self.dims, self.balance)?,
             None => target_states(&self.states, self.dims)?,
         })
     }
@@ -253,14 +254,14 @@ impl Tables {
 /// States under the target's label.
 fn target_states(rows: &[f32], dims: usize) -> Result<ScoreData<'_>> {
     let condition = Condition::Constant(vec![0.0]);
-    Ok(ScoreData::new(vec![Part { rows, condition }], dims, 1, false)?)
+    Ok(ScoreData::new(vec![Part { rows, condition }], dims, 1, Balance::Rows)?)
 }
 
 /// Batches of a loss that tells when to stop: 8192 draws of a row, a noise level and noise at 128 rows a batch.
 const PROBE_BATCHES: u64 = 64;
 
 /// The losses of a network on rows that it does not see, if there are any, and on those that it sees.
-fn losses(trainer: &Trainer, held_out: Option<&ScoreData>, seen: &ScoreData) -> Result<Figures> {
+fn losses(trainer: &Trainer, held_out: Option<&ScoreData>, seen: &ScoreData) -> Result<Metrics> {
     let of = |data: &ScoreData| trainer.loss_on(std::slice::from_ref(data), PROBE_BATCHES);
     let held_out = held_out.map(of).transpose()?;
     Ok(held_out.map(|l| ("held_out_loss", l)).into_iter().chain([("training_loss", of(seen)?)]).collect())
@@ -297,7 +298,7 @@ fn train_both(
     };
     match results {
         // The one that diverged is the reason, not the one that was stopped for it.
-        (Err(Error::Diffusion(DiffusionError::Interrupted { .. })), Err(reason)) | (Err(reason), _) => Err(reason),
+        (Err(Error::Diffusion(DiffusionError::Interrupted(_))), Err(reason)) | (Err(reason), _) => Err(reason),
         (Ok(state), transition) => Ok((state, transition?)),
     }
 }

@@ -1,10 +1,10 @@
-//! What a fit needs besides data and settings: seeds, a device, and somebody who keeps checkpoints and figures.
+//! The inputs of a fit besides data and settings: seeds, a device, and where checkpoints and metrics are stored.
 
 use tce_base::{FileError, Streams};
 use tce_diffusion::{Chunks, DiffusionError, ScoreModel};
 use tce_nn::{Checkpoints, Device, cpu};
 
-/// Who keeps what a fit has done so far, so that it can be resumed and looked at. Nothing is kept unless a method says so.
+/// Stores checkpoints, metrics and samples of a fit. The default methods store nothing.
 pub trait Keeper: Sync {
     /// The checkpoints of the training `name`.
     ///
@@ -15,19 +15,19 @@ pub trait Keeper: Sync {
         Ok(Checkpoints::none())
     }
 
-    /// Trainings begin, or are resumed after so many updates: figures of later updates will come again.
+    /// Trainings begin, or are resumed after so many updates: metrics of later updates will come again.
     ///
     /// # Errors
-    /// If figures cannot be kept.
+    /// If metrics cannot be kept.
     fn begin(&self, trainings: &[(&str, u64)]) -> Result<(), FileError> {
         let _ = trainings;
         Ok(())
     }
 
-    /// A figure of the training `name` after `step` updates, one value per member. It must not fail: a figure is no reason to lose
+    /// A metric of the training `name` after `step` updates, one value per member. It must not fail: a metric is no reason to lose
     /// a training.
-    fn record(&self, name: &str, step: u64, figure: &'static str, values: &[f64]) {
-        let _ = (name, step, figure, values);
+    fn record(&self, name: &str, step: u64, metric: &'static str, values: &[f64]) {
+        let _ = (name, step, metric, values);
     }
 
     /// The network of the training `name` at the end of a cycle, after `step` updates.
@@ -51,14 +51,14 @@ pub struct Nothing;
 
 impl Keeper for Nothing {}
 
-/// Who computes for whom.
+/// Members, device and storage of a fit.
 #[derive(Clone, Copy)]
 pub struct Work<'a> {
     /// The members of the population, one policy or data set each; member i equals a fit of seed i alone.
     pub seeds: &'a [u64],
     /// What computes the networks.
     pub device: &'a Device,
-    /// Who keeps checkpoints and figures.
+    /// Storage of checkpoints and metrics.
     pub keeper: &'a dyn Keeper,
 }
 

@@ -1,9 +1,8 @@
-//! The course of a whole command: a line above the bars that says which of its steps is under way and, where that is known, how long
-//! the rest takes.
+//! The progress of a whole command: a line above the bars with the running step and, if known, the time left.
 //!
-//! An estimate counts what was measured and nothing else. A step's cost is known once a step of the same kind has come to its end, in
+//! An estimate uses measured costs only. A step's cost is known once a step of the same kind has come to its end, in
 //! this command or, where the command names a file for costs, in an earlier one on this machine; of the step under way also where its
-//! last bar shows it. Where the cost of one step that is still to come is not known, no time is told.
+//! last bar shows it. If the cost of one remaining step is unknown, no time is shown.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -116,7 +115,7 @@ fn course() -> MutexGuard<'static, Option<Course>> {
     COURSE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Tells which steps the command will take, in their order. `memory` is a file with what such steps have cost on this machine, to be
+/// Plans the steps of the command, in their order. `memory` is a file with what such steps have cost on this machine, to be
 /// read now and kept up to date.
 pub fn plan_course(steps: Vec<Step>, memory: Option<PathBuf>) {
     let known = memory.as_ref().and_then(|path| read_if_there(path).ok().flatten());
@@ -124,7 +123,7 @@ pub fn plan_course(steps: Vec<Step>, memory: Option<PathBuf>) {
     *course() = Some(Course { steps, costs, memory, ..Course::default() });
 }
 
-/// The step `name`, if it is one that was planned and is still to come, is under way from now on.
+/// The step `name` begins, if it was planned and has not run yet.
 pub fn begin_step(name: &str) {
     let (line, keep) = {
         let mut course = course();
@@ -140,11 +139,20 @@ pub fn begin_step(name: &str) {
     }
 }
 
-/// The command has come to its end, so that its line goes away. `whole`: the last step came to its end, too.
-pub fn end_course(whole: bool) {
+/// How the last step of a command ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LastStep {
+    /// It is done: what it cost is remembered.
+    Done,
+    /// An error or an interruption ended it.
+    BrokenOff,
+}
+
+/// The command has come to its end, so that its line goes away.
+pub fn end_course(last: LastStep) {
     let ended = course().take();
     drop(HEADLINE.lock().unwrap_or_else(PoisonError::into_inner).take());
-    if let (Some(mut course), true) = (ended, whole) {
+    if let (Some(mut course), true) = (ended, last == LastStep::Done) {
         let before = course.costs.clone();
         course.end(Instant::now());
         // A command that found everything done changes nothing.

@@ -50,11 +50,11 @@ impl FileError {
     }
 }
 
-/// Whether something called `path` could be written: told by a temporary file in the nearest folder above it that exists. Asked
-/// before long work, whose result would have no place in the end.
+/// Checks that `path` can be written, with a temporary file in the nearest existing folder above it. Call it before long work whose
+/// result goes there.
 ///
 /// # Errors
-/// What the system says, under the name `path`.
+/// The system's error, under the name `path`.
 pub fn ensure_writable(path: &Path) -> Result<(), FileError> {
     let whole = std::path::absolute(path).map_err(|e| FileError::new(path, "write", e))?;
     try_nearest(whole.parent().unwrap_or(&whole)).map_err(|e| FileError::new(path, "write", e))
@@ -78,7 +78,7 @@ fn try_nearest(folder: &Path) -> io::Result<()> {
     }
 }
 
-/// A file in the making. Write to [`AtomicFile::path`] or [`AtomicFile::file`]; [`AtomicFile::commit`] gives it its
+/// A file that is being written. Write to [`AtomicFile::path`] or [`AtomicFile::file`]; [`AtomicFile::commit`] gives it its
 /// name. Dropped without a commit, it leaves nothing behind.
 pub struct AtomicFile {
     target: PathBuf,
@@ -109,7 +109,7 @@ impl AtomicFile {
         flush_directory(&target)
     }
 
-    /// As [`Self::commit`], unless the name is taken: of several that want it, the first one gets it. Whether this one did.
+    /// As [`Self::commit`], unless the name is taken: the first of several processes gets it. Returns whether this one did.
     pub fn commit_first(self) -> Result<bool, FileError> {
         let Self { target, temporary } = self.complete()?;
         link_first(temporary.path(), &target)
@@ -134,7 +134,7 @@ impl AtomicFile {
     }
 }
 
-/// A folder in the making, as [`AtomicFile`] is a file in the making. Dropped without a commit, it leaves nothing behind.
+/// A folder that is being filled, as [`AtomicFile`] is a file that is being written. Dropped without a commit, it leaves nothing behind.
 pub struct AtomicFolder {
     target: PathBuf,
     temporary: TempDir,
@@ -147,7 +147,7 @@ impl AtomicFolder {
         Ok(Self { target: target.to_owned(), temporary })
     }
 
-    /// Where the files go until the commit. Whoever writes one flushes it.
+    /// Where the files go until the commit. The caller flushes them.
     pub fn path(&self) -> &Path {
         self.temporary.path()
     }
@@ -214,7 +214,8 @@ fn flush_directory(path: &Path) -> Result<(), FileError> {
     Ok(())
 }
 
-/// The first of `files`, names below `directory` with their SHA-256, that is not what it was, and how; none if all are.
+/// The first of `files` (names below `directory` with their SHA-256) that is missing or changed, and what is wrong; None if all are
+/// intact.
 pub fn first_damaged(directory: &Path, files: &BTreeMap<String, String>) -> Option<String> {
     files.iter().find_map(|(name, expected)| {
         let file = directory.join(name);
@@ -235,8 +236,8 @@ pub fn move_into_place(own: &Path, target: &Path) -> Result<(), FileError> {
     flush_directory(target)
 }
 
-/// Gives the complete file `own` the name `target`, too, unless that name is taken: of several that want it, the first one gets it.
-/// Whether this one did.
+/// Links the complete file `own` to the name `target`, unless that name is taken: the first of several processes gets it. Returns whether
+/// this one did.
 ///
 /// # Errors
 /// If the name is free and cannot be given.
@@ -276,7 +277,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
     filled(path, bytes)?.commit()
 }
 
-/// The file `path` in the making, with all its bytes.
+/// The file `path`, not committed yet, with all its bytes.
 fn filled(path: &Path, bytes: &[u8]) -> Result<AtomicFile, FileError> {
     let mut file = AtomicFile::create(path)?;
     file.file().write_all(bytes).map_err(|e| FileError::new(path, "write", e))?;
@@ -288,7 +289,7 @@ pub fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), FileError>
     write_atomically(path, &json(path, value)?)
 }
 
-/// As [`write_json`], unless there is such a file: of several that write it, the first one does. Whether this one did.
+/// As [`write_json`], unless there is such a file: the first of several processes writes it. Returns whether this one did.
 pub fn write_json_first<T: Serialize>(path: &Path, value: &T) -> Result<bool, FileError> {
     filled(path, &json(path, value)?)?.commit_first()
 }

@@ -1,10 +1,36 @@
 //! The wish to stop.
 
+use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
 use signal_hook::iterator::Signals;
+
+/// The user asked to stop ([`interrupted`]), and the work stopped at a safe point. The error of every crate wraps it as `Interrupted`.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct Interrupted(Cow<'static, str>);
+
+impl Interrupted {
+    /// The exit code of a command that was interrupted.
+    pub const EXIT_CODE: i32 = 130;
+
+    /// Nothing of the work is kept.
+    pub fn nothing_kept() -> Self {
+        Self("interrupted".into())
+    }
+
+    /// There are checkpoints: the same command resumes from them.
+    pub fn resumable() -> Self {
+        Self("interrupted; what was finished is kept, and the same command continues from there".into())
+    }
+
+    /// `done` of `total` `unit` of `work` are done.
+    pub fn after(work: &str, done: u64, total: u64, unit: &str) -> Self {
+        Self(format!("{work}: interrupted after {done} of {total} {unit}").into())
+    }
+}
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 

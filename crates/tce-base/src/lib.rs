@@ -1,5 +1,5 @@
-//! What every crate of the workspace stands on: named random streams, files that are never half-written, and long
-//! work that shows its progress and can be interrupted.
+//! The base of all crates: named random streams, files that are whole or absent, and long work that shows its progress and can be
+//! interrupted.
 
 pub mod course;
 pub mod files;
@@ -15,19 +15,19 @@ pub mod statistics;
 pub mod terminal;
 pub mod words;
 
-pub use course::{Headline, Step, begin_step, end_course, plan_course};
+pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
 pub use files::{
     AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
     read_if_there, sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
 };
-pub use interrupt::{interrupted, listen_for_interrupts, set_interrupted};
+pub use interrupt::{Interrupted, interrupted, listen_for_interrupts, set_interrupted};
 pub use metrics::Metrics;
 pub use owner::Owner;
+pub use progress::{Progress, Running, running};
 pub use random::{Rng, Streams};
 pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use statistics::{mean_std, plus_minus};
-pub use progress::{Progress, Running, running};
 pub use terminal::{set_listener, set_quiet};
 pub use words::{did_you_mean, file_inside, nearest};
 

@@ -1,4 +1,4 @@
-//! What training says while it runs: JSON lines for programs, TensorBoard events for eyes.
+//! Metrics of a training while it runs: JSON lines for programs, TensorBoard events for people.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -10,7 +10,7 @@ use crate::{FileError, read_if_there, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-/// The metrics of one stage, written line by line: what a killed run had is there to be looked at.
+/// The metrics of one stage, written line by line: a killed run leaves what it had.
 pub struct Metrics {
     path: PathBuf,
     lines: BufWriter<File>,
@@ -19,7 +19,7 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Starts `metrics.jsonl` and `tensorboard/` in `directory`, or goes on with what is there, without the lines for
+    /// Starts `metrics.jsonl` and `tensorboard/` in `directory`, or appends to what is there, without the lines for
     /// whose stage and step `keep` is false: a killed program may have written more than its checkpoint knows.
     pub fn resume(directory: &Path, keep: impl Fn(&str, u64) -> bool) -> Result<Self, FileError> {
         Self::resume_behind(directory, Vec::new(), keep)
@@ -87,16 +87,16 @@ impl Metrics {
     }
 }
 
-/// The values named `figure` of `member` in the stage `stage` of a `metrics.jsonl`, by step; nothing where there is no such file.
+/// The values named `metric` of `member` in the stage `stage` of a `metrics.jsonl`, by step; nothing where there is no such file.
 ///
 /// # Errors
 /// If the file cannot be read.
-pub fn recorded(path: &Path, stage: &str, member: usize, figure: &str) -> Result<BTreeMap<u64, f64>, FileError> {
+pub fn recorded(path: &Path, stage: &str, member: usize, metric: &str) -> Result<BTreeMap<u64, f64>, FileError> {
     let text = read_if_there(path)?.unwrap_or_default();
     let text = String::from_utf8_lossy(&text);
     let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
     let own = lines.filter(|line| line.stage == stage && line.member == member);
-    Ok(own.filter_map(|line| Some((line.step, line.values.get(figure)?.as_f64()?))).collect())
+    Ok(own.filter_map(|line| Some((line.step, line.values.get(metric)?.as_f64()?))).collect())
 }
 
 /// One line of `metrics.jsonl`.

@@ -1,10 +1,10 @@
-//! Whose a file in the making is, so that what a killed process left is told from what a living one is at work on.
+//! The owner of a temporary file: leftovers of killed processes can be told from the work of running ones.
 
 use std::fs;
 use std::path::Path;
 use std::sync::OnceLock;
 
-/// The process that owns a file or directory in the making: machine, process and when that started, because numbers of processes come again.
+/// The process that owns a temporary file or directory: machine, process and its start time, because process numbers are reused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Owner {
     machine: String,
@@ -40,7 +40,7 @@ impl Owner {
         Some(Self { machine: parts.next()?.to_owned(), process, started })
     }
 
-    /// Whether it is certainly gone. Of another machine nothing is certain.
+    /// Whether the process has certainly ended. Nothing is certain of a process on another machine.
     pub fn dead(&self) -> bool {
         let known = self.started != 0 && self.machine == Self::this().machine;
         known && started(self.process) != Some(self.started)

@@ -1,4 +1,4 @@
-//! Long work: a bar with what is left on a terminal, a plain line now and then elsewhere.
+//! Progress of long work: a bar with the time left on a terminal, a plain line at intervals elsewhere.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -12,18 +12,18 @@ use crate::terminal::{Counter, LINES, in_place, quiet, say};
 
 /// Time between two plain lines where there is no terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(15);
-/// Time between two looks at a bar that does not move, so that what is left does not stand still.
+/// Interval at which a bar without progress is drawn again, so that its time left is updated.
 const TICK: Duration = Duration::from_millis(500);
 
-/// What has been begun and is not over.
+/// Work that has begun and is not finished.
 static RUNNING: Mutex<Vec<(Weak<Counter>, &'static str)>> = Mutex::new(Vec::new());
 
-/// How far a piece of work is.
+/// The progress of a piece of work.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Running {
     /// What it is.
     pub label: String,
-    /// Units that are done.
+    /// Finished units.
     pub done: u64,
     /// All units.
     pub total: u64,
@@ -33,7 +33,7 @@ pub struct Running {
     pub seconds: f64,
 }
 
-/// The pieces of work that are under way, the oldest first: for a host that shows progress in its own way.
+/// The running pieces of work, the oldest first: for a host that shows progress in its own way.
 pub fn running() -> Vec<Running> {
     let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
     running.retain(|(counter, _)| counter.strong_count() > 0);
@@ -50,7 +50,7 @@ pub fn running() -> Vec<Running> {
 pub struct Progress {
     unit: &'static str,
     counter: Arc<Counter>,
-    /// Whether every unit costs the same, so that the rate tells what is left.
+    /// Whether every unit costs the same, so that the time left follows from the rate.
     even: bool,
     bar: Option<ProgressBar>,
     quiet: bool,

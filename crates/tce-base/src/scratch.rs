@@ -1,5 +1,5 @@
-//! A place for a file in the making whose name is known only to this process, so that what a killed process left is told from what
-//! another one is at work on, and removed.
+//! Temporary directories that are named by their process. Leftovers of killed processes can be told from the work of running ones, and
+//! are removed.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,7 @@
-//! Files that know whether they are whole: a line with a key and a checksum, then the bytes.
+//! Files with a cache key and a checksum in their first line.
 //!
-//! `tce-sealed 1 KEY SHA256\n`. The key tells what the bytes are a part of (the hash of a specification), so that leftovers of other
-//! work are not taken for one's own; the checksum, of key and bytes, tells damage.
+//! `tce-sealed 1 KEY SHA256\n`. The key is the hash of the specification that the bytes belong to: leftovers of other work
+//! are recognised by it. The checksum covers key and bytes, and detects damage.
 
 use std::path::Path;
 

@@ -1,14 +1,14 @@
-//! What bars, the line above them and notes share: one thing that draws on stderr.
+//! The one writer for stderr, which bars, the line above them and notes share.
 
 use std::io::IsTerminal;
-use std::sync::{LazyLock, PoisonError, RwLock};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{LazyLock, PoisonError, RwLock};
 use std::time::Instant;
 
 use console::style;
 use indicatif::MultiProgress;
 
-/// All lines that change in place. One thing draws them, so that bars side by side and notes between them leave no line behind.
+/// All lines that change in place. They have one writer, so that bars side by side and notes between them leave no line behind.
 pub(crate) static LINES: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
 
 static QUIET: AtomicBool = AtomicBool::new(false);
@@ -60,7 +60,7 @@ macro_rules! note {
     ($($text:tt)*) => { $crate::terminal::say(&format!($($text)*)) };
 }
 
-/// How far a piece of work is. Apart from the bar, because the line above the bars asks while they are drawn.
+/// The progress of a piece of work. Separate from the bar, because the line above the bars asks while they are drawn.
 pub(crate) struct Counter {
     pub(crate) label: String,
     pub(crate) total: u64,

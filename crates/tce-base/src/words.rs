@@ -1,11 +1,11 @@
-//! What a message says of a word that it does not know.
+//! Suggestions for unknown words in messages.
 
 use std::path::Path;
 
 /// Two words are alike from here on (Jaro-Winkler, 0 to 1): one or two letters wrong, missing or swapped.
 const ALIKE: f64 = 0.8;
 
-/// The one of `known` that is most like `word`, if any is much like it.
+/// The most similar word of `known`, if any is similar enough.
 pub fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let plain = |text: &str| text.to_lowercase().replace(['_', ' '], "-");
     let word = plain(word);

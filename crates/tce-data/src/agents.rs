@@ -1,4 +1,4 @@
-//! Which robot a data set is of, judged by its numbers.
+//! Which robot a data set is of, told by its numbers.
 
 use crate::{Agent, Transitions};
 

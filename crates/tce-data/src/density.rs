@@ -23,6 +23,7 @@
 //! is not 0.
 
 use serde::{Deserialize, Serialize};
+
 use tce_base::Streams;
 use tce_base::random::choose;
 

@@ -57,9 +57,9 @@ pub enum DataError {
     /// The operating system refused.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The user asked to stop (see [`tce_base::interrupted`]).
-    #[error("interrupted")]
-    Interrupted,
+    /// The user asked to stop.
+    #[error(transparent)]
+    Interrupted(#[from] tce_base::Interrupted),
 }
 
 impl DataError {

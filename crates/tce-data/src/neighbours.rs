@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::Progress;
+use tce_base::{Interrupted, Progress};
 
 use crate::moments::Moments;
 use crate::product::Transposed;
@@ -63,7 +63,7 @@ pub fn nn_distances(source: &Rows<'_>, target: &Rows<'_>, options: &NeighbourOpt
     let mut out = vec![0.0f32; source.len()];
     out.par_chunks_mut(ROWS).enumerate().try_for_each_init(Scratch::default, |scratch, (b, out)| {
         if tce_base::interrupted() {
-            return Err(DataError::Interrupted);
+            return Err(DataError::from(Interrupted::nothing_kept()));
         }
         search.block(source, b * ROWS, out, scratch);
         if let Some(p) = &progress {

@@ -12,7 +12,7 @@
 //! P/a of the last such step by u and v: one pass over it per iteration.
 
 use rayon::prelude::*;
-use tce_base::Progress;
+use tce_base::{Interrupted, Progress};
 
 use crate::product::Transposed;
 use crate::{DataError, Rows};
@@ -165,7 +165,7 @@ impl<'a> Block<'a> {
         let mut state = self.restart(&vec![0.0; self.n], kernel);
         for iteration in 1..self.options.max_iterations {
             if tce_base::interrupted() {
-                return Err(DataError::Interrupted);
+                return Err(DataError::from(Interrupted::nothing_kept()));
             }
             if iteration % CHECK_EVERY == 0 {
                 let error: f64 = state.columns.iter().zip(&state.v).map(|(c, v)| (c * v - b).abs()).sum();

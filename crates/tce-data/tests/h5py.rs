@@ -1,4 +1,4 @@
-//! Python's h5py as the judge of our files, and as a writer of others.
+//! Python's h5py as a check of our files, and as a writer of others.
 
 mod common;
 

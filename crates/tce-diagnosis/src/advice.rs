@@ -1,4 +1,4 @@
-//! Whether to use the generated rows, in a sentence with the figures that decide.
+//! Whether to use the generated rows, in a sentence with the metrics that decide.
 //!
 //! | decides | do not use | use |
 //! |---|---|---|

@@ -3,7 +3,7 @@
 //! The paper draws a "coverage curve" over y_max (Fig. 3 a.2) and does not define it. Here it is the coverage of Naeem et al. 2020
 //! (Reliable Fidelity and Diversity Metrics, Eq. 7): a reference state is covered if a generated one lies within the distance of
 //! its k-th nearest neighbour among the reference states of its own domain. As many rows as reference rows of the very same
-//! distribution cover 1 − 2⁻ᵏ of them; more rows cover more, so that figures are comparable between sets of equal size alone.
+//! distribution cover 1 − 2⁻ᵏ of them; more rows cover more, so that metrics are comparable between sets of equal size alone.
 
 use serde::{Deserialize, Serialize};
 use tce_data::{DataError, NeighbourOptions, Rows, nn_distances};

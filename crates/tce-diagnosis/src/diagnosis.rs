@@ -25,7 +25,7 @@ pub struct Diagnosis {
     pub z_threshold: Option<f64>,
     /// λ of the run's mixture.
     pub lambda: f64,
-    /// Generated rows behind every figure.
+    /// Generated rows behind every metric.
     pub rows: usize,
     /// Target rows.
     pub target_rows: usize,
@@ -35,7 +35,7 @@ pub struct Diagnosis {
     pub covered_by_target: Option<Coverage>,
     /// Whether those are of other episodes, as fresh rows are.
     pub covered_by_fresh: bool,
-    /// Figures over y_max, ascending.
+    /// Metrics over y_max, ascending.
     pub bounds_of_y: Vec<AtBound>,
     /// The rows as they are drawn under the run's own y_max.
     pub sampled: Sampled,
@@ -55,30 +55,30 @@ pub struct Diagnosis {
     pub theorem: Option<Bounds>,
     /// λ from the data alone.
     pub choice: Option<Choice>,
-    /// What the same rule says where the simulator measures, to judge `choice` by.
+    /// What the same rule says where the simulator measures, to check `choice` against.
     pub choice_by_simulator: Option<Choice>,
     /// What could not be measured, and why.
     pub notes: Vec<String>,
 }
 
 impl Diagnosis {
-    /// The figures at one y_max.
+    /// The metrics at one y_max.
     pub fn at(&self, y_max: f64) -> Option<&AtBound> {
         self.bounds_of_y.iter().find(|b| (b.y_max - y_max).abs() < 1e-9)
     }
 
-    /// The figures at the run's own y_max.
+    /// The metrics at the run's own y_max.
     pub fn at_own_bound(&self) -> Option<&AtBound> {
         self.at(self.y_max)
     }
 }
 
-/// Figures at one y_max.
+/// Metrics at one y_max.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AtBound {
     /// The label bound.
     pub y_max: f64,
-    /// Rows that hold a number that is not finite. They are part of no figure but `rejected`.
+    /// Rows that hold a number that is not finite. They are part of no metric but `rejected`.
     pub lost: usize,
     /// Coverage by rows that pass the filter; None where too few do, which `Diagnosis::notes` tell.
     pub coverage: Option<Coverage>,

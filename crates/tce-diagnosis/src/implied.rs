@@ -5,7 +5,7 @@
 //!
 //! With draws â_1 .. â_k at a state and the action a that the behaviour took there, averages over rows and components:
 //!
-//! | figure | definition |
+//! | metric | definition |
 //! |---|---|
 //! | `single` | √ mean over draws of (â_j − a)² |
 //! | `mean` | √ of (mean over draws of â_j − a)² |
@@ -20,7 +20,7 @@ use crate::numbers::Spread;
 /// Errors of implied actions at some target rows.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ImpliedErrors {
-    /// Rows that are part of the figures.
+    /// Rows that are part of the metrics.
     pub rows: usize,
     /// Rows in which a draw is not made of finite numbers. They are left out.
     pub lost: usize,
@@ -110,7 +110,7 @@ pub struct ImpliedRollout {
     pub returns: Option<(f64, f64)>,
     /// Mean length of an episode, in steps.
     pub length: Option<f64>,
-    /// Why there are no figures, where there are none.
+    /// Why there are no metrics, where there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failed: Option<String>,
 }

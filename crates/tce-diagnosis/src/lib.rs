@@ -1,4 +1,4 @@
-//! What can be measured of generated and source rows, beside the target's: the paper's analyses (Fig. 1a, Fig. 3, Appendix F),
+//! Measures of generated and source rows against the target's: the paper's analyses (Fig. 1a, Fig. 3, Appendix F),
 //! Theorem 1, and a λ chosen by it. Nothing here knows networks: their predictions come in as numbers.
 //!
 //! | question | file |

@@ -129,7 +129,7 @@ impl HeldOut {
     ///
     /// # Errors
     /// If the user interrupts.
-    pub fn judge(&self, generated: &[f32], streams: &Streams) -> Result<Option<Memorisation>, DataError> {
+    pub fn compare(&self, generated: &[f32], streams: &Streams) -> Result<Option<Memorisation>, DataError> {
         let (dim, count) = (self.dim, generated.len() / self.dim);
         let mut order: Vec<usize> = (0..count).collect();
         order.shuffle(&mut streams.stream("shares of the episodes"));
@@ -191,11 +191,11 @@ mod tests {
         out
     }
 
-    fn judge(training: &[f32], generated: &[f32], episodes: usize) -> Memorisation {
+    fn compare(training: &[f32], generated: &[f32], episodes: usize) -> Memorisation {
         let each = training.len() / 4 / episodes;
         let ranges = (0..episodes).map(|e| e * each..(e + 1) * each).collect();
         let held_out = HeldOut::new(training.to_vec(), 4, ranges).unwrap().unwrap();
-        held_out.judge(generated, &Streams::new(1)).unwrap().unwrap()
+        held_out.compare(generated, &Streams::new(1)).unwrap().unwrap()
     }
 
     #[test]
@@ -203,21 +203,21 @@ mod tests {
         for count in [2, 3, 5, 50] {
             let centres = vec![0.0; count];
             let training = episodes("training", &centres, 1000 / count);
-            let copies = judge(&training, &training, count);
+            let copies = compare(&training, &training, count);
             assert_eq!((copies.verdict(), copies.identical), (Verdict::Copies, 1.0), "{count} episodes: {copies:?}");
             assert!((copies.probability - copies.of_copies).abs() < 0.03, "{count} episodes: {copies:?}");
             let mut near = training.clone();
             near.iter_mut().zip(episodes("noise", &centres, 1000 / count)).for_each(|(x, z)| *x += 0.05 * z);
-            let near = judge(&training, &near, count);
+            let near = compare(&training, &near, count);
             assert_eq!((near.verdict(), near.identical), (Verdict::Copies, 0.0), "{count} episodes: {near:?}");
             // A perfect generator, however few the episodes are.
-            let fresh = judge(&training, &episodes("fresh", &centres, 2000 / count), count);
+            let fresh = compare(&training, &episodes("fresh", &centres, 2000 / count), count);
             assert!(fresh.verdict() == Verdict::Fresh && (fresh.probability - 0.5).abs() < 0.05, "{count}: {fresh:?}");
             let mut far: Vec<f32> = training.iter().map(|x| 3.0 * x + 2.0).collect();
-            assert_eq!(judge(&training, &far, count).verdict(), Verdict::Beside, "{count} episodes");
+            assert_eq!(compare(&training, &far, count).verdict(), Verdict::Beside, "{count} episodes");
             // Every fiftieth of them a training row: too few for p, and nothing that chance does.
             far.chunks_exact_mut(4).zip(training.chunks_exact(4)).step_by(50).for_each(|(x, t)| x.copy_from_slice(t));
-            let said = judge(&training, &far, count).to_string();
+            let said = compare(&training, &far, count).to_string();
             assert!(said.ends_with("than held-out rows do; 2.0 % of them are training rows"), "{said}");
         }
     }
@@ -225,10 +225,10 @@ mod tests {
     /// The limit of the measure: where every episode is a place of its own, rows of the others' places look like copies. What is left
     /// to tell them by is how many are identical.
     #[test]
-    fn episodes_apart_from_each_other_cannot_be_judged_by_p() {
+    fn episodes_apart_from_each_other_cannot_be_measured_by_p() {
         let centres = [0.0, 30.0, 60.0, 90.0, 120.0];
         let training = episodes("training", &centres, 200);
-        let fresh = judge(&training, &episodes("fresh", &centres, 400), 5);
+        let fresh = compare(&training, &episodes("fresh", &centres, 400), 5);
         assert!(fresh.identical == 0.0 && fresh.verdict() == Verdict::Copies, "{fresh:?}");
     }
 
@@ -243,7 +243,7 @@ mod tests {
         let one = std::iter::once(0..5).collect();
         assert!(HeldOut::new(rows.clone(), 1, one).unwrap().is_none());
         assert!(HeldOut::new(rows, 1, vec![0..3, 3..5]).unwrap().is_none(), "two rows are too few to compare with");
-        assert!(held_out.judge(&[], &Streams::new(0)).unwrap().is_none());
+        assert!(held_out.compare(&[], &Streams::new(0)).unwrap().is_none());
     }
 
     proptest! {

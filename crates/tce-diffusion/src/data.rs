@@ -23,6 +23,15 @@ pub struct Part<'a> {
     pub condition: Condition<'a>,
 }
 
+/// How often the rows of each part are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Balance {
+    /// Every part as often as every other, in turn.
+    Parts,
+    /// Every row as often as every other.
+    Rows,
+}
+
 /// What one member trains on.
 #[derive(Clone, Debug)]
 pub struct ScoreData<'a> {
@@ -30,17 +39,17 @@ pub struct ScoreData<'a> {
     counts: Vec<usize>,
     dims: usize,
     condition: usize,
-    balanced: bool,
+    balance: Balance,
     dropout: f64,
 }
 
 impl<'a> ScoreData<'a> {
-    /// Rows of width `dims` with conditions of width `condition`. Rows of a batch are drawn with replacement:
-    /// `balanced`, equally many from each part (in turn); otherwise all rows of all parts are equally likely.
+    /// Rows of width `dims` with conditions of width `condition`. Rows of a batch are drawn with replacement,
+    /// as often as `balance` says.
     ///
     /// # Errors
     /// If a part is empty, of another width, or holds a number that is not finite.
-    pub fn new(parts: Vec<Part<'a>>, dims: usize, condition: usize, balanced: bool) -> Result<Self, DiffusionError> {
+    pub fn new(parts: Vec<Part<'a>>, dims: usize, condition: usize, balance: Balance) -> Result<Self, DiffusionError> {
         if parts.is_empty() {
             return Err(DiffusionError::input("training data", "no parts", "at least one"));
         }
@@ -67,7 +76,7 @@ impl<'a> ScoreData<'a> {
             }
             counts.push(n);
         }
-        Ok(Self { parts, counts, dims, condition, balanced, dropout: 0.0 })
+        Ok(Self { parts, counts, dims, condition, balance, dropout: 0.0 })
     }
 
     /// The same, and with probability `rate` a drawn row comes under the condition of all zeros: what the network learns for that
@@ -87,9 +96,14 @@ impl<'a> ScoreData<'a> {
     ///
     /// # Errors
     /// As [`ScoreData::new`].
-    pub fn labelled(source: &'a [f32], target: &'a [f32], dims: usize, balanced: bool) -> Result<Self, DiffusionError> {
+    pub fn labelled(
+        source: &'a [f32],
+        target: &'a [f32],
+        dims: usize,
+        balance: Balance,
+    ) -> Result<Self, DiffusionError> {
         let part = |rows, label| Part { rows, condition: Condition::Constant(vec![label]) };
-        Self::new(vec![part(source, 1.0), part(target, 0.0)], dims, 1, balanced)
+        Self::new(vec![part(source, 1.0), part(target, 0.0)], dims, 1, balance)
     }
 
     /// Rows under one condition each, for the transition score network.
@@ -97,7 +111,7 @@ impl<'a> ScoreData<'a> {
     /// # Errors
     /// As [`ScoreData::new`].
     pub fn conditioned(rows: &'a [f32], dims: usize, on: &'a [f32], width: usize) -> Result<Self, DiffusionError> {
-        Self::new(vec![Part { rows, condition: Condition::Rows(on) }], dims, width, false)
+        Self::new(vec![Part { rows, condition: Condition::Rows(on) }], dims, width, Balance::Rows)
     }
 
     /// Width of the rows.
@@ -117,7 +131,7 @@ impl<'a> ScoreData<'a> {
 
     /// Draws row `i` of a batch: (row, condition).
     pub(crate) fn draw(&self, rng: &mut Rng, i: usize) -> (&[f32], &[f32]) {
-        let (part, row) = if self.balanced {
+        let (part, row) = if self.balance == Balance::Parts {
             let part = i % self.parts.len();
             (part, draw_index(rng, self.counts[part]))
         } else {
@@ -151,20 +165,20 @@ mod tests {
     #[test]
     fn balanced_batches_hold_equal_shares() {
         let (source, target) = (vec![1.0; 900], vec![2.0; 100]);
-        let share = |balanced| {
-            let data = ScoreData::labelled(&source, &target, 1, balanced).unwrap();
+        let share = |balance| {
+            let data = ScoreData::labelled(&source, &target, 1, balance).unwrap();
             let mut rng = Streams::new(0).stream("b");
             let draws = (0..10_000).map(|i| data.draw(&mut rng, i));
             draws.filter(|(row, label)| row[0] == 2.0 && label[0] == 0.0).count() as f64 / 1e4
         };
-        assert_eq!(share(true), 0.5);
-        assert!((share(false) - 0.1).abs() < 0.01);
+        assert_eq!(share(Balance::Parts), 0.5);
+        assert!((share(Balance::Rows) - 0.1).abs() < 0.01);
     }
 
     #[test]
     fn a_condition_that_is_there_differs_from_none() {
         assert_eq!(present(&[0.0, 2.0, 0.0, 0.0], 2), [0.0, 2.0, 1.0, 0.0, 0.0, 1.0]);
-        let data = ScoreData::labelled(&[1.0], &[0.0], 1, true).unwrap();
+        let data = ScoreData::labelled(&[1.0], &[0.0], 1, Balance::Parts).unwrap();
         let error = data.with_dropout(1.0).unwrap_err().to_string();
         assert_eq!(error, "condition dropout: found 1, expected at least 0 and less than 1");
     }

@@ -35,18 +35,9 @@ pub enum DiffusionError {
         /// The learning rate.
         learning_rate: f64,
     },
-    /// The user asked to stop ([`tce_base::interrupted`]).
-    #[error("{label}: interrupted after {done} of {total} {unit}")]
-    Interrupted {
-        /// Which work.
-        label: String,
-        /// Units done.
-        done: u64,
-        /// Units wanted.
-        total: u64,
-        /// Their name.
-        unit: &'static str,
-    },
+    /// The user asked to stop.
+    #[error(transparent)]
+    Interrupted(#[from] tce_base::Interrupted),
 }
 
 impl DiffusionError {

@@ -20,7 +20,7 @@ mod train;
 mod until_done;
 
 pub use cycles::{CycleEnd, UntilDone};
-pub use data::{Condition, Part, ScoreData, present};
+pub use data::{Balance, Condition, Part, ScoreData, present};
 pub use error::DiffusionError;
 pub use model::{Chunks, Request, ScoreModel, uniform_labels};
 pub use network::{BoundNetwork, NetworkConfig, ScoreNetwork};

@@ -64,7 +64,7 @@ impl Request<'_> {
 pub struct Chunks<'a> {
     /// Their directory.
     pub directory: &'a Path,
-    /// A word that stands for all that decides the samples, besides name, member and chunk.
+    /// Cache key: hash of all inputs of the samples, besides name, member and chunk.
     pub key: &'a str,
 }
 

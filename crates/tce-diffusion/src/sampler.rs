@@ -13,6 +13,7 @@
 //! and of .05: Heun 1.9 and 4.9 % on `Karras`, 3.2 and 3.3 % on `Log`; DPM-Solver++(2M) 2.1 and 4.7 %, 1.2 and 1.2 %.
 
 use serde::{Deserialize, Serialize};
+use tce_base::Interrupted;
 use tce_nn::Tensor;
 
 use crate::{DiffusionError, Grid, Level, Process};
@@ -179,12 +180,7 @@ fn score(denoiser: &impl Denoiser, x: &Tensor<3>, level: Level) -> Tensor<3> {
 fn go_on(step: usize, steps: usize) -> Result<(), DiffusionError> {
     match tce_base::interrupted() {
         false => Ok(()),
-        true => Err(DiffusionError::Interrupted {
-            label: "sampling".into(),
-            done: step as u64,
-            total: steps as u64,
-            unit: "denoising steps",
-        }),
+        true => Err(Interrupted::after("sampling", step as u64, steps as u64, "denoising steps").into()),
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use tce_base::random::fill_normal;
-use tce_base::{Progress, Streams, interrupted};
+use tce_base::{Interrupted, Progress, Streams, interrupted};
 use tce_nn::{
     Averaged, Checkpoints, Device, Module, NamedParameters, NetworkError, Tensor, Trained, cosine_decay, host,
     on_threads_of, tensor,
@@ -202,8 +202,8 @@ impl Trainer {
                 checkpoints.keep(self.step, on_threads_of(&device, || self.state())).map_err(NetworkError::from)?;
             }
             if stop && whole {
-                let label = format!("training of {}", self.name);
-                return Err(DiffusionError::Interrupted { label, done: self.step, total: steps, unit: "steps" });
+                let work = format!("training of {}", self.name);
+                return Err(Interrupted::after(&work, self.step, steps, "steps").into());
             }
             let so_far = sum.take();
             sum = Some(on_threads_of(&device, || {

@@ -15,7 +15,7 @@
 //! | – | `first` | 7 500 | bench/generator.md |
 //! | – | `limit` | 120 000 | bench/generator.md |
 //! | – | `gain` | .1 | bench/generator.md |
-//! | c_k | the caller's `judge` | – | – |
+//! | c_k | the caller's function | – | – |
 
 use std::path::Path;
 
@@ -26,18 +26,18 @@ use crate::{DiffusionError, ScoreData, ScoreModel, Trainer};
 
 impl Trainer {
     /// Trains until every member is done, and returns the best networks and what was measured at the ends of the cycles. A member's
-    /// result does not depend on the others. `judge` gets a model at the end of a cycle and returns one criterion per member, the
+    /// result does not depend on the others. `criterion` gets a model at the end of a cycle and returns one criterion per member, the
     /// less the better; `on_loss` as in [`Trainer::train`], whose rules for checkpoints hold here too.
     ///
     /// # Errors
-    /// As [`Trainer::train`], and those of `judge`.
+    /// As [`Trainer::train`], and those of `criterion`.
     pub fn train_until_done<E: From<DiffusionError>>(
         &mut self,
         data: &[ScoreData],
         plan: &UntilDone,
         checkpoints: &mut Checkpoints,
         mut on_loss: impl FnMut(u64, &[f32]),
-        mut judge: impl FnMut(&Self) -> Result<Vec<f64>, E>,
+        mut criterion: impl FnMut(&Self) -> Result<Vec<f64>, E>,
     ) -> Result<(ScoreModel, Vec<CycleEnd>), E> {
         plan.check()?;
         self.check_data(data)?;
@@ -56,7 +56,7 @@ impl Trainer {
             let begin = end - length;
             let rate = |step: u64| cosine_decay(highest, step.saturating_sub(begin), length);
             self.advance(data, end, rate, checkpoints, &mut on_loss)?;
-            let criterion = judge(self)?;
+            let criterion = criterion(self)?;
             let end = CycleEnd { step: end, criterion };
             let now = self.model().parameters();
             self.found.take(plan, end, now);
@@ -115,14 +115,14 @@ mod tests {
         // Member 0 gets worse in its second cycle and is done; member 1 goes on to the limit.
         let script = [[1.0, 1.0], [2.0, 0.5], [0.1, 0.2]];
         let mut seen = Vec::new();
-        let mut judge = |t: &Trainer| {
+        let mut criterion = |t: &Trainer| {
             seen.push(t.model().parameters());
             Ok::<_, DiffusionError>(script[seen.len() - 1].to_vec())
         };
         let members = [Streams::new(5), Streams::new(6)];
         let mut whole = trainer(&members);
         let (model, ends) =
-            whole.train_until_done(&data, &PLAN, &mut Checkpoints::none(), |_, _| {}, &mut judge).unwrap();
+            whole.train_until_done(&data, &PLAN, &mut Checkpoints::none(), |_, _| {}, &mut criterion).unwrap();
         assert_eq!(ends.iter().map(|e| e.step).collect::<Vec<_>>(), [100, 300, 700]);
         let got = model.parameters();
         assert_eq!(got.member(0), seen[0].member(0), "the first cycle was member 0's best before it was done");
@@ -140,12 +140,12 @@ mod tests {
         let mut rest = trainer(&members);
         rest.restore(&first.state(), Path::new("x")).unwrap();
         let mut at = 0;
-        let judge = |_: &Trainer| {
+        let criterion = |_: &Trainer| {
             at += 1;
             Ok::<_, DiffusionError>(script[at].to_vec())
         };
         let (again, ends_again) =
-            rest.train_until_done(&data, &PLAN, &mut Checkpoints::none(), |_, _| {}, judge).unwrap();
+            rest.train_until_done(&data, &PLAN, &mut Checkpoints::none(), |_, _| {}, criterion).unwrap();
         assert_eq!(ends_again, ends);
         assert_eq!(again.parameters(), got);
     }

@@ -6,8 +6,8 @@ use tce_base::Streams;
 use tce_base::random::fill_normal;
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{
-    Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, Start, TrainConfig, Trainer, Ve, Vp, present,
-    uniform_labels,
+    Balance, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, Start, TrainConfig, Trainer, Ve, Vp,
+    present, uniform_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -33,7 +33,7 @@ fn small(dims: usize, condition: usize) -> NetworkConfig {
 #[test]
 fn the_label_moves_samples_between_the_domains() {
     let (source, target) = (normal("source", 2000, 1.0, 0.2), normal("target", 400, -1.0, 0.2));
-    let data = ScoreData::labelled(&source, &target, 1, true).unwrap();
+    let data = ScoreData::labelled(&source, &target, 1, Balance::Parts).unwrap();
     for (process, sampler) in [
         (Process::Edm(Edm::default()), Sampler::DpmSolver { steps: 20 }),
         (Process::Vp(Vp::default()), Sampler::Heun { steps: 18 }),
@@ -101,7 +101,7 @@ fn a_dropped_condition_is_the_whole_distribution_and_guidance_sharpens() {
 
 fn population() -> (ScoreModel, [Streams; 2]) {
     let rows = normal("rows", 300, 0.0, 1.0);
-    let data = ScoreData::labelled(&rows[..150], &rows[150..], 3, true).unwrap();
+    let data = ScoreData::labelled(&rows[..150], &rows[150..], 3, Balance::Parts).unwrap();
     let model = train(Process::Vp(Vp::default()), small(3, 1), &data, 2, 30, 1e-3);
     (model, [Streams::new(20), Streams::new(21)])
 }
@@ -164,7 +164,7 @@ fn requests_that_do_not_fit_are_refused() {
     assert_eq!(error(request, Sampler::Heun { steps: 0 }, &streams), "sampler.steps: found 0, expected at least 2");
 
     let rows = [0.5, -0.5];
-    let data = ScoreData::labelled(&rows[..1], &rows[1..], 1, true).unwrap();
+    let data = ScoreData::labelled(&rows[..1], &rows[1..], 1, Balance::Parts).unwrap();
     let model = train(Process::Ve(Ve { start: Start::Data, ..Ve::default() }), small(1, 1), &data, 1, 1, 1e-3);
     let error = model.sample(request, &sampler, &streams[..1], None).unwrap_err().to_string();
     assert!(error.starts_with("start of 'x': found nothing, expected training rows"), "{error}");

@@ -30,7 +30,7 @@ fn main() {
         ("delta, cosine, drop 0", PairConfig { drop_path: 0.0, ..default.clone() }),
         ("next, cosine, drop .1", PairConfig { input: PairInput::Next, ..default.clone() }),
     ] {
-        let config = LabelConfig { model, steps, ..LabelConfig::default() };
+        let config = LabelConfig { model, steps, ..LabelConfig::paper() };
         let models = train_labels(&[member(1)], &config, &mut Checkpoints::none(), &cpu())
             .expect("good data")
             .expect("not interrupted");

@@ -9,7 +9,7 @@
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
 //! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
-//! | rivals of TCE, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
+//! | prior methods, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
 //! | choosing among a batch's rows | [`selection`] |
 //! | DmC: scored rows, filtered and weighed | [`dmc`] |
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
@@ -65,6 +65,7 @@ pub use sequence_policy::{SequencePolicy, SequenceSpec};
 pub use srpo::{Srpo, SrpoConfig};
 pub use td3_bc::{Td3Bc, Td3BcConfig};
 pub use training::{
-    Journal, Lane, Learner, Meter, Outcome, Place, Report, Steps, member_noise, prepare, train, train_side_by_side,
+    Journal, Learner, Meter, Outcome, Place, Report, Steps, TrainingJob, member_noise, prepare, train,
+    train_side_by_side,
 };
 pub use transition_model::{Densities, TransitionConfig, TransitionModel, train_transition_models};

@@ -36,7 +36,7 @@ fn members(seeds: &[u64]) -> Vec<Member> {
 
 fn config(input: PairInput) -> LabelConfig {
     let model = PairConfig { input, width: 48, ..PairConfig::default() };
-    LabelConfig { model, steps: 1500, learn_terminals: true, ..LabelConfig::default() }
+    LabelConfig { model, steps: 1500, learn_terminals: true, ..LabelConfig::paper() }
 }
 
 #[test]

@@ -119,7 +119,7 @@ fn a_member_equals_a_run_of_its_own_and_a_repetition_equals_itself() {
     let data = linear_data();
     let best = Arc::new(best_trajectories(&data, 0.5).unwrap());
     let members = [member(1, &data, false), member(2, &best, true), member(3, &data, true)];
-    let config = IqlConfig { hidden: vec![32, 32], ..IqlConfig::default() };
+    let config = IqlConfig { hidden: vec![32, 32], ..IqlConfig::paper() };
     let policies = |members: &[Member]| {
         let buffer = Buffer::new(members.to_vec(), 32).unwrap();
         let mut iql = Iql::new(&buffer, &config, Regulariser::None, 60, &cpu()).unwrap();
@@ -142,9 +142,9 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let buffer = Buffer::new(members.clone(), 256).unwrap();
-            let mut iql = Iql::new(&buffer, &IqlConfig::default(), Regulariser::None, 3, &cpu()).unwrap();
+            let mut iql = Iql::new(&buffer, &IqlConfig::paper(), Regulariser::None, 3, &cpu()).unwrap();
             run(&mut iql, &buffer, 3);
-            let labels = LabelConfig { steps: 3, learn_terminals: true, ..LabelConfig::default() };
+            let labels = LabelConfig { steps: 3, learn_terminals: true, ..LabelConfig::paper() };
             let labels = train_labels(&members, &labels, &mut Checkpoints::none(), &cpu()).unwrap().unwrap();
             (iql.state().to_bytes(), labels.state().to_bytes())
         })
@@ -156,7 +156,7 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
 fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
     let data = linear_data();
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 32).unwrap();
-    let config = IqlConfig { policy_extraction: PolicyExtraction::AwrLogprob, ..IqlConfig::default() };
+    let config = IqlConfig { policy_extraction: PolicyExtraction::AwrLogprob, ..IqlConfig::paper() };
     let new = || Iql::new(&buffer, &config, Regulariser::None, 20, &cpu()).unwrap();
     let mut whole = new();
     go(&mut whole, &buffer, 0, 20);
@@ -196,7 +196,7 @@ fn corridor_config() -> IqlConfig {
         polyak: 0.05,
         temperature: 10.0,
         actor: ActorConfig { hidden: vec![32, 32], lr: 3e-3, ..ActorConfig::default() },
-        ..IqlConfig::default()
+        ..IqlConfig::paper()
     }
 }
 
@@ -256,7 +256,7 @@ fn regularisers_pull_the_policy_to_the_target_behaviour() {
     let (target, source) = (side(0.7, 200), side(-0.7, 400));
     let both = |seed| Member { parts: vec![target.clone(), source.clone()], ..member(seed, &target, true) };
     let buffer = Buffer::new(vec![both(1), both(2)], 64).unwrap();
-    let mut config = RegulariserConfig { samples: 3, draws: 2, ..RegulariserConfig::default() };
+    let mut config = RegulariserConfig { samples: 3, draws: 2, ..RegulariserConfig::paper() };
     (config.cvae.hidden, config.cvae.steps) = (vec![32], 400);
     let actions = |kind, beta_reg| -> Vec<f32> {
         let regulariser = Regulariser::prepare(kind, &buffer, &config, Place::NONE, &cpu()).unwrap().unwrap();
@@ -281,7 +281,7 @@ fn scored_member(seed: u64) -> Member {
 }
 
 fn small_behaviour() -> RegulariserConfig {
-    let mut behaviour = RegulariserConfig { samples: 3, ..RegulariserConfig::default() };
+    let mut behaviour = RegulariserConfig { samples: 3, ..RegulariserConfig::paper() };
     (behaviour.cvae.hidden, behaviour.cvae.steps) = (vec![32], 300);
     behaviour
 }

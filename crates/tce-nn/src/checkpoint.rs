@@ -1,5 +1,5 @@
-//! The state of a training on disk, in two generations: a program that is killed while it writes, and a file that goes bad
-//! afterwards, cost some minutes of work and never the result.
+//! Checkpoints of a training on disk, in two generations. A kill during a write, or a file that is damaged later, costs some minutes of
+//! work, never the result.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,7 +15,7 @@ const GENERATION: &str = "checkpoint.generation";
 /// Metadata of a checkpoint: the step it stands at.
 const STEP: &str = "checkpoint.step";
 
-/// Sets the time between two checkpoints of a training, 60 s unless set. It decides what a kill costs, not the result.
+/// Sets the time between two checkpoints of a training, 60 s unless set. Results do not depend on it.
 pub fn set_checkpoint_seconds(seconds: f64) {
     MILLISECONDS.store((seconds.clamp(0.0, 1e9) * 1e3) as u64, Ordering::Relaxed);
 }
@@ -69,12 +69,12 @@ impl Checkpoints {
         Ok(Self { place: Some(Place { paths, key: key.to_owned(), generation }), restored, last: Instant::now() })
     }
 
-    /// The step at which the training goes on, if there was a checkpoint.
+    /// The step from which the training resumes, if there was a checkpoint.
     pub fn step(&self) -> Option<u64> {
         self.restored.as_ref().map(|r| r.0)
     }
 
-    /// The state to go on from, and the file it came from; once.
+    /// The state to resume from, with its file; once.
     pub fn restore(&mut self) -> Option<(u64, NamedParameters, PathBuf)> {
         self.restored.take()
     }

@@ -1,11 +1,9 @@
 //! Coverage expansion on two tables.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use pyo3::prelude::*;
-use tce_data::Transitions;
-use tce_run::augmentation::Augmented;
+use tce_run::augment::own_tables::Augmented;
 use tce_run::config::Config;
 use tce_run::inputs::Inputs;
 use tce_run::own::Own;
@@ -14,11 +12,6 @@ use crate::errors::Raise;
 use crate::settings::{Robot, Settings};
 use crate::table::Table;
 use crate::work::{Progress, attended};
-
-/// The rows of `table` for the program to keep: moved where nobody else has them.
-pub fn taken(rows: &Arc<Transitions>) -> Transitions {
-    Transitions::clone(rows)
-}
 
 /// Generated rows for `target`, and the report on them as JSON with the attributes of a file of them.
 #[pyfunction]
@@ -37,8 +30,7 @@ pub fn augment(
     let (source, target) = (source.rows.clone(), target.rows.clone());
     let augmented = attended(py, progress, move || {
         tce_base::ensure_folder(&cache)?;
-        let inputs = Inputs::of_rows(Some(taken(&source)), taken(&target), None, &own)?;
-        drop((source, target));
+        let inputs = Inputs::of_rows(Some(source), target, None, &own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         Augmented::new(&inputs, &config, seed, &cache, &tce_nn::cpu())
     })?;

@@ -22,7 +22,7 @@ pub fn main(py: Python<'_>, arguments: Vec<String>) -> u8 {
         match tce::Cli::of(arguments).map(tce::Cli::run) {
             Ok(Ok(())) => 0,
             Ok(Err(error)) => {
-                tce_base::end_course(false);
+                tce_base::end_course(tce_base::LastStep::BrokenOff);
                 eprint!("{}", tce::told(&error));
                 u8::try_from(error.exit_code()).unwrap_or(1)
             }

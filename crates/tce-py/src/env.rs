@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use tce_base::Streams;
 use tce_data::{ScoreTable, parse_environment};
 use tce_run::Error;
-use tce_zoo::actors::{Arena, evaluate as rolled_out};
+use tce_zoo::actors::{Actions, Arena, evaluate as rolled_out};
 
 use crate::errors::{Raise, exception};
 use crate::policy::Policy;
@@ -64,7 +64,7 @@ impl Env {
         let action: Vec<f32> = action.as_array().iter().copied().collect();
         let mut observation = vec![0.0; self.dims.0];
         let result = self.robot.lock().unwrap_or_else(PoisonError::into_inner).step(&action, &mut observation);
-        Ok((PyArray1::from_vec(py, observation), result.reward.into(), result.terminal, result.unstable))
+        Ok((PyArray1::from_vec(py, observation), result.reward, result.terminal, result.unstable))
     }
 
     /// Coordinates and velocities of MuJoCo.
@@ -97,7 +97,14 @@ pub fn evaluate(
     let policy = policy.policy.clone();
     let evaluation = attended(py, progress, move || {
         let arena = Arena::new(agent, shift, ScoreTable::default());
-        Ok(rolled_out(&policy, arena, episodes, Streams::new(seed), deterministic, tce_base::interrupted)?)
+        Ok(rolled_out(
+            &policy,
+            arena,
+            episodes,
+            Streams::new(seed),
+            Actions::mean_if(deterministic),
+            tce_base::interrupted,
+        )?)
     })?;
     Ok(serde_json::to_string(&evaluation).expect("plain data"))
 }

@@ -81,7 +81,9 @@ impl Policy {
         let (rows, (obs_dim, act_dim)) = (observations.shape()[0], self.policy.dims());
         if observations.shape()[1] != obs_dim || memories.lanes.len() != rows {
             let found = format!("{rows} x {} with {} memories", observations.shape()[1], memories.lanes.len());
-            return Err(PyValueError::new_err(format!("observations: found {found}, expected N x {obs_dim} with N memories")));
+            return Err(PyValueError::new_err(format!(
+                "observations: found {found}, expected N x {obs_dim} with N memories"
+            )));
         }
         let observations: Vec<f32> = observations.as_array().iter().copied().collect();
         let mut actions = vec![0.0; rows * act_dim];

@@ -7,7 +7,6 @@ use tce_run::inputs::Inputs;
 use tce_run::pipeline::seeds as counted;
 use tce_run::training_run::{Comparison, TrainingRun, ensure_fits};
 
-use crate::augment::taken;
 use crate::errors::Raise;
 use crate::settings::{Robot, Settings};
 use crate::table::Table;
@@ -47,8 +46,8 @@ pub fn train(
     let extra = extra.map(|table| (table.rows.clone(), table.column_of("origin").map(<[f32]>::to_vec)));
     let trained = attended(py, progress, move || {
         tce_base::ensure_folder(&out)?;
-        let extra = extra.as_ref().map(|(rows, origin)| (taken(rows), origin.as_deref()));
-        let inputs = Inputs::of_rows(source.as_ref().map(taken), taken(&target), extra, &own)?;
+        let extra = extra.as_ref().map(|(rows, origin)| (rows.clone(), origin.as_deref()));
+        let inputs = Inputs::of_rows(source, target, extra, &own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         let run = TrainingRun { config: &config, seeds: &seeds, own: &own, comparison, out: &out };
         run.run(&inputs, &tce_nn::cpu())

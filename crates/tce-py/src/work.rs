@@ -3,8 +3,8 @@
 use std::any::Any;
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
-use std::{process, thread};
 use std::time::Duration;
+use std::{process, thread};
 
 use pyo3::prelude::*;
 use tce_run::Error;
@@ -96,7 +96,8 @@ pub fn attended<T: Send>(
         }
         (py.detach(|| worker.join()), stopped)
     });
-    tce_base::end_course(result.as_ref().is_ok_and(Result::is_ok));
+    let done = result.as_ref().is_ok_and(Result::is_ok);
+    tce_base::end_course(if done { tce_base::LastStep::Done } else { tce_base::LastStep::BrokenOff });
     tce_base::set_interrupted(false);
     tce_base::set_listener(None);
     let rest = messages.try_iter().try_for_each(|message| log(py, &message));

@@ -49,7 +49,7 @@ pub struct Member {
     pub seed: u64,
     /// What became of its policy.
     pub verdict: Verdict,
-    /// Undiscounted returns of the episodes it was judged by.
+    /// Undiscounted returns of the episodes that evaluated it.
     pub returns: Vec<f64>,
 }
 
@@ -152,9 +152,9 @@ impl RunFolder {
             path: config_path.clone(),
             what: format!("there is no such file; {AGAIN}"),
         })?;
-        let config_hash = sha256_hex(&bytes)[..16].to_owned();
         let bad = |found: String| ReportError::field(&config_path, "(the whole file)", found, "TOML", AGAIN);
         let config = String::from_utf8(bytes).map_err(|e| bad(e.to_string()))?;
+        let config_hash = sha256_hex(with_old_names(&config).as_bytes())[..16].to_owned();
         let table: toml::Table = config.parse().map_err(|e: toml::de::Error| bad(e.message().to_owned()))?;
 
         let spec_path = directory.join("spec.json");
@@ -187,7 +187,7 @@ impl RunFolder {
 
 fn member(done: &Document<'_>, m: usize, scored: bool, evaluated: bool) -> Result<Member> {
     let seed = done.get(&format!("/summary/seeds/{m}"), "a whole number from 0", Value::as_u64)?;
-    let number = "a finite number, or null where the policy could not be judged";
+    let number = "a finite number, or null where the policy could not be evaluated";
     let score = match scored {
         true => done.get(&format!("/summary/scores/{m}"), number, |v| match v {
             Value::Null => Some(None),
@@ -209,6 +209,11 @@ fn member(done: &Document<'_>, m: usize, scored: bool, evaluated: bool) -> Resul
         (None, None) => Verdict::Unscored,
     };
     Ok(Member { seed, verdict, returns })
+}
+
+/// A configuration as earlier versions wrote it, so that equal settings have equal hashes: `[single_stage]` was `[joint]`.
+fn with_old_names(config: &str) -> String {
+    config.replace("\n[single_stage", "\n[joint")
 }
 
 /// Whether `mode = "published"` stands anywhere.

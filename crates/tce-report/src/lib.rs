@@ -1,4 +1,4 @@
-//! What many runs come to, and a page that says so: statistics over tasks and seeds, the tables of the paper beside ours, and
+//! Reports of many runs: statistics over tasks and seeds, the tables of the paper beside ours, and
 //! the report as HTML, Markdown and LaTeX.
 //!
 //! [`diagnosis`] shows what `tce diagnose` found. [`study::Study`] holds what there is, [`analysis::analyse`] decides every figure and warning, and [`html`] and [`text`] only

@@ -65,9 +65,9 @@ pub fn table(shift: Shift) -> Option<&'static PaperTable> {
     TABLES.iter().find(|t| t.shift == shift)
 }
 
-/// The paper's name for a variant of ours.
-pub fn counterpart(variant: &str) -> Option<&'static str> {
-    Some(match variant.strip_suffix("-published").unwrap_or(variant) {
+/// The paper's name for a method of ours (`Method::base`).
+pub fn counterpart(method: &str) -> Option<&'static str> {
+    Some(match method {
         "tce-og" => "TCE(OG)",
         "tce-nn" => "TCE(NN)",
         "tce-ot" => "TCE(OT)",
@@ -178,7 +178,7 @@ mod tests {
         assert_eq!(components().iter().find(|c| c.0 == "Target Only").unwrap().1.mean, 41.4);
         assert_eq!(runtime()[1][0], "IQL*");
         assert!(table(Shift::Source).is_none());
-        assert_eq!(counterpart("otdf-published"), Some("OTDF"));
+        assert_eq!(counterpart("otdf"), Some("OTDF"));
         assert_eq!(counterpart("bc"), None);
     }
 }

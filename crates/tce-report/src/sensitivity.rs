@@ -110,7 +110,9 @@ mod tests {
             id: format!("{variant} {label}").trim().into(),
             title: if label.is_empty() { "TCE(OG)".into() } else { format!("TCE(OG), {label}") },
             variant: variant.into(),
-            floor: false,
+            base: variant.into(),
+            published: false,
+            baseline: false,
             plain: label.is_empty(),
         };
         let methods = [

@@ -50,8 +50,12 @@ pub struct Method {
     pub title: String,
     /// The variant, without an override's name.
     pub variant: String,
-    /// Whether it is one of the floors that every result has to beat.
-    pub floor: bool,
+    /// The method of that variant, whichever form of it is run: `dara` of `dara-published`.
+    pub base: String,
+    /// Whether the variant is the method as its public code has it, faults included.
+    pub published: bool,
+    /// Whether it is one of the baselines that every result has to beat.
+    pub baseline: bool,
     /// Whether nothing but the variant decides its settings, so that the paper's column of this name is its counterpart.
     pub plain: bool,
 }
@@ -154,7 +158,7 @@ pub struct Study {
     pub sweep: bool,
     /// Where it is.
     pub directory: String,
-    /// Columns, floors first.
+    /// Columns, baselines first.
     pub methods: Vec<Method>,
     /// Results.
     pub runs: Vec<Run>,

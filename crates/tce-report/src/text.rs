@@ -69,19 +69,19 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
     let c = analysis.comparison.as_ref()?;
     let mut header: Vec<String> =
         ["Method", "Runs", "Interquartile mean", "Mean", "Median", "Optimality gap", "Total"].map(Into::into).to_vec();
-    header.extend(c.floors.iter().map(|f| format!("P(> {})", analysis.methods[*f].title)));
+    header.extend(c.baselines.iter().map(|f| format!("P(> {})", analysis.methods[*f].title)));
     header.extend(["Points above the best baseline", "Finding"].map(Into::into));
     let rows = c.methods.iter().map(|a| {
         let [iqm, median, mean, gap] = a.over_seeds;
         let mut row = vec![title(analysis, a.method), a.runs.to_string()];
         row.extend([iqm, mean, median, gap, a.total].iter().map(|e| estimate(e, 1)));
-        match &a.over_floors {
+        match &a.over_baselines {
             Some(over) => row.extend(over.iter().map(|e| estimate(e, 2))),
-            None => row.extend(c.floors.iter().map(|_| "–".into())),
+            None => row.extend(c.baselines.iter().map(|_| "–".into())),
         }
         row.push(c.gap(a).map_or("–".into(), |gap| format!("{gap:+.1}")));
-        row.push(match (analysis.methods[a.method].floor, c.improvement(a)) {
-            (true, _) if c.best_floor() == Some(a.method) => "the best baseline".into(),
+        row.push(match (analysis.methods[a.method].baseline, c.improvement(a)) {
+            (true, _) if c.best_baseline() == Some(a.method) => "the best baseline".into(),
             (true, _) => "baseline".into(),
             (false, Some((_, finding))) => finding.word().into(),
             (false, None) => "–".into(),

@@ -15,7 +15,7 @@ fn task(agent: Agent, target: Quality) -> Task {
     Task { agent, shift: Shift::Morph, source: Quality::Medium, target }
 }
 
-/// Two tasks, four floors, TCE(OG) and a method with a hostile name.
+/// Two tasks, four baselines, TCE(OG) and a method with a hostile name.
 fn study(root: &Path) -> Study {
     let methods = vec![
         method("bc-raw", "BC, raw", true),
@@ -107,7 +107,7 @@ fn figures_hold_a_mark_for_every_method() {
     let (_, page) = page(&study(root.path()));
     let xml = xml(&page);
     let document = roxmltree::Document::parse(&xml).unwrap();
-    // Four aggregates and a profile of six methods, two against the best floor, scores and losses of six methods on two tasks.
+    // Four aggregates and a profile of six methods, two against the best baseline, scores and losses of six methods on two tasks.
     assert_eq!(with_class(&document, "g", "mark"), 4 * 6 + 6 + 2 + 2 * 2 * 6);
     assert_eq!(with_class(&document, "line", "thick"), 4 * 6 + 2);
     assert_eq!(with_class(&document, "polygon", "band"), 6 + 2 * 2 * 6);
@@ -118,7 +118,7 @@ fn figures_hold_a_mark_for_every_method() {
 }
 
 #[test]
-fn the_page_has_the_numbers_the_floors_and_the_paper() {
+fn the_page_has_the_numbers_the_baselines_and_the_paper() {
     let root = tempfile::tempdir().unwrap();
     let study = study(root.path());
     let (analysis, page) = page(&study);
@@ -140,8 +140,8 @@ fn the_page_has_the_numbers_the_floors_and_the_paper() {
         assert!(page.contains(text), "{text}");
     }
     let c = analysis.comparison.as_ref().unwrap();
-    assert_eq!((c.tasks.len(), c.methods.len(), c.floors.len()), (2, 6, 4));
-    assert_eq!(c.best_floor(), Some(3));
+    assert_eq!((c.tasks.len(), c.methods.len(), c.baselines.len()), (2, 6, 4));
+    assert_eq!(c.best_baseline(), Some(3));
     let og = c.methods.iter().find(|a| analysis.methods[a.method].id == "tce-og").unwrap();
     assert_eq!(c.improvement(og).unwrap().0.point, 1.0);
     assert!(page.contains("Of two methods compared with Target Only, two are shown to beat it"));

@@ -1,6 +1,6 @@
-//! The configuration of a run, typed. What a field's comment says is what `tce config show KEY` tells a user ([`crate::keys`]): a sentence on
-//! what the key does, and behind `Source:` where its value is from, if it is the same for every preset. Why a preset has a value is told
-//! beside the value, in `presets/`; where a value comes from, by [`crate::layers`].
+//! The typed configuration of a run. The doc comment of a field is the text of `tce config show KEY` ([`crate::keys`]): one sentence on
+//! what the key does, and after `Source:` the origin of its value, if all presets share it. The reason for a preset's value is a comment
+//! in `presets/`. [`crate::layers`] records which layer set a value.
 
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
@@ -35,12 +35,14 @@ pub struct Config {
     #[serde(default, skip_serializing_if = "FittedQConfig::is_default")]
     pub fitted_q: FittedQConfig,
     /// One network over whole rows, for `mixture.generated` = synther and dmc.
-    pub joint: SingleStageConfig,
+    // It was called `joint`. Keys of finished runs are hashes of what is serialised: the old name stays there.
+    #[serde(rename(serialize = "joint"), alias = "joint")]
+    pub single_stage: SingleStageConfig,
     /// The data the policy is learned from.
     pub mixture: MixtureConfig,
     /// The learner of the policy.
     pub learner: LearnerConfig,
-    /// How policies are judged.
+    /// How policies are evaluated.
     pub evaluation: EvaluationConfig,
 }
 
@@ -107,9 +109,9 @@ pub enum GeneratedRows {
     None,
     /// TCE's: states, successors, filter, labels (`generator`, `filter`, `labels`).
     Tce,
-    /// Whole transitions like the target's (`joint`).
+    /// Whole transitions like the target's (`single_stage`).
     Synther,
-    /// Whole transitions like the most target-like ones of source and target (`joint`).
+    /// Whole transitions like the most target-like ones of source and target (`single_stage`).
     Dmc,
 }
 
@@ -142,7 +144,7 @@ pub struct MixtureConfig {
     pub lambda: f64,
 }
 
-/// How policies are judged.
+/// How policies are evaluated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
@@ -185,24 +187,29 @@ impl Config {
         ] {
             within(key, value as f64, 1.0, 1e12)?;
         }
-        let joint = &self.joint;
-        within("joint.ema", joint.ema, 0.0, 0.999_999)?;
-        within("joint.guidance.dropout", joint.guidance.dropout, 0.0, 0.999)?;
-        within("joint.guidance.weight", joint.guidance.weight, 0.0, 100.0)?;
-        within("joint.guidance.from", joint.guidance.from, 0.0, 0.99)?;
+        let single_stage = &self.single_stage;
+        within("single_stage.ema", single_stage.ema, 0.0, 0.999_999)?;
+        within("single_stage.guidance.dropout", single_stage.guidance.dropout, 0.0, 0.999)?;
+        within("single_stage.guidance.weight", single_stage.guidance.weight, 0.0, 100.0)?;
+        within("single_stage.guidance.from", single_stage.guidance.from, 0.0, 0.99)?;
         // A row is its own nearest neighbour.
-        within("joint.scores.neighbour", joint.scores.neighbour as f64, 2.0, 1e6)?;
-        within("joint.scores.reference", joint.scores.reference as f64, joint.scores.neighbour as f64, 1e12)?;
+        within("single_stage.scores.neighbour", single_stage.scores.neighbour as f64, 2.0, 1e6)?;
+        within(
+            "single_stage.scores.reference",
+            single_stage.scores.reference as f64,
+            single_stage.scores.neighbour as f64,
+            1e12,
+        )?;
         for (key, value) in [
-            ("joint.width", joint.width),
-            ("joint.embedding", joint.embedding),
-            ("joint.batch", joint.batch),
-            ("joint.rows", joint.rows),
+            ("single_stage.width", single_stage.width),
+            ("single_stage.embedding", single_stage.embedding),
+            ("single_stage.batch", single_stage.batch),
+            ("single_stage.rows", single_stage.rows),
         ] {
             within(key, value as f64, 1.0, 1e12)?;
         }
-        joint.process.check().map_err(|e| Error::Usage(format!("joint.process: {e}")))?;
-        joint.sampler.check().map_err(|e| Error::Usage(format!("joint.sampler: {e}")))?;
+        single_stage.process.check().map_err(|e| Error::Usage(format!("single_stage.process: {e}")))?;
+        single_stage.sampler.check().map_err(|e| Error::Usage(format!("single_stage.sampler: {e}")))?;
         let about = self.learner.algorithm.about();
         if about.scores == RowScores::Density {
             let MixtureConfig { generated, source, .. } = self.mixture;
@@ -231,6 +238,11 @@ impl Config {
 
     /// As TOML, for a run's directory.
     pub fn to_toml(&self) -> String {
+        self.to_keyed_toml().replace("\n[joint", "\n[single_stage")
+    }
+
+    /// As TOML with the names that keys are hashed from: the table `single_stage` is called `joint`, as in earlier versions.
+    pub(crate) fn to_keyed_toml(&self) -> String {
         toml::to_string_pretty(self).expect("a configuration is plain data")
     }
 }

@@ -1,7 +1,7 @@
-//! The steps of the commands that have several, for the line above the bars ([`tce_base::course`]).
+//! The steps of commands with several steps, for the line above the progress bars ([`tce_base::course`]).
 //!
-//! What a step costs is kept in the folder of runs, `costs.json`: seconds by kind, and the kind names the machine, the number of threads,
-//! and everything in the configuration that the cost depends on. So the second run of a kind knows from its beginning how long it takes.
+//! The cost of each step is stored in `costs.json` in the folder of runs: seconds by kind. A kind names the machine, the number of threads
+//! and every setting that the cost depends on. The second run of a kind can therefore estimate its time from the start.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use tce_base::{Step, plan_course, sha256_hex};
 use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
-use crate::processor::Processor;
+use crate::device_kind::DeviceKind;
 
 /// The file with costs, in the folder of runs.
 const COSTS: &str = "costs.json";
@@ -21,13 +21,13 @@ pub struct Course<'a> {
     /// What the sizes of networks depend on: the robot, or the columns of the data.
     robot: String,
     seeds: usize,
-    device: Processor,
+    device: DeviceKind,
     root: &'a Path,
     steps: Vec<Step>,
 }
 
 impl<'a> Course<'a> {
-    /// A course without steps; costs are kept in `root`.
+    /// No steps yet; costs are stored in `root`.
     pub fn new(robot: impl ToString, seeds: usize, device: &Device, root: &'a Path) -> Self {
         Self { robot: robot.to_string(), seeds, device: device.into(), root, steps: Vec::new() }
     }
@@ -66,7 +66,7 @@ impl<'a> Course<'a> {
                     g.batch,
                     g.source_states
                 ]);
-                // Whoever tells when a network is done is trained first.
+                // Label models decide when q_tran is done, so that they are trained first.
                 if g.transition_steps == Length::Auto {
                     self.step("label models", labels);
                     self.step("score networks", networks);
@@ -80,8 +80,8 @@ impl<'a> Course<'a> {
                 self.step("generated rows", json!([g.sampler, g.rows, g.support]));
             }
             GeneratedRows::Synther | GeneratedRows::Dmc => {
-                self.step("joint network", json!(config.joint));
-                self.step("generated rows", json!([config.joint.sampler, config.joint.rows]));
+                self.step("single-stage network", json!(config.single_stage));
+                self.step("generated rows", json!([config.single_stage.sampler, config.single_stage.rows]));
             }
         }
         let (earlier, own) = self.steps.split_at_mut(before);
@@ -101,7 +101,7 @@ impl<'a> Course<'a> {
         step.size = learner.steps(mixed) as f64;
         // The other learners train something else before, with bars of its own.
         step.last_bar = (learner.algorithm == Algorithm::Bc).then_some("learn ");
-        // Methods of one kind cost the same, whatever they are called.
+        // The cost depends on the settings, not on the name.
         let name = step.name.clone();
         if let Some(kind) = step.kind.strip_prefix(&name) {
             step.kind = format!("learn{kind}");
@@ -141,7 +141,7 @@ mod tests {
         for variant in [Variant::Bc, Variant::TceOg, Variant::TceNn] {
             let config = Layered::new(Preset::Quick, None, Some(variant), None, &[]).unwrap().config().unwrap();
             course.generating(&config);
-            course.learning(&variant.name(), &config, config.mixture.generated != GeneratedRows::None);
+            course.learning(variant.name(), &config, config.mixture.generated != GeneratedRows::None);
         }
         let steps: Vec<_> = course.steps.iter().map(|s| (s.name.as_str(), s.size)).collect();
         let expected = [

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use tce_base::Interrupted;
+
 /// Any reason for which a command fails.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -10,13 +12,13 @@ pub enum Error {
     Usage(String),
     /// A data set is not usable.
     #[error(transparent)]
-    Data(#[from] tce_data::DataError),
+    Data(tce_data::DataError),
     /// Source and target do not belong together.
     #[error(transparent)]
     Agents(#[from] tce_data::AgentMismatch),
     /// The simulator failed.
     #[error(transparent)]
-    Sim(#[from] tce_sim::SimError),
+    Sim(tce_sim::SimError),
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] tce_base::FileError),
@@ -28,7 +30,7 @@ pub enum Error {
     Learn(#[from] tce_learn::LearnError),
     /// The generator failed.
     #[error(transparent)]
-    Diffusion(#[from] tce_diffusion::DiffusionError),
+    Diffusion(tce_diffusion::DiffusionError),
     /// A report could not be made.
     #[error(transparent)]
     Report(#[from] tce_report::ReportError),
@@ -44,8 +46,8 @@ pub enum Error {
         what: String,
     },
     /// The user asked to stop.
-    #[error("interrupted; what was finished is kept, and the same command continues from there")]
-    Interrupted,
+    #[error(transparent)]
+    Interrupted(#[from] Interrupted),
 }
 
 impl Error {
@@ -54,28 +56,52 @@ impl Error {
         Self::Missing { path: path.to_owned(), what: what.into() }
     }
 
+    /// The user asked to stop; the same command resumes from the checkpoints.
+    pub fn interrupted() -> Self {
+        Interrupted::resumable().into()
+    }
+
     /// 2 for a wrong call, 130 after an interrupt, 1 for the rest.
     pub fn exit_code(&self) -> i32 {
         match self {
             Error::Usage(_) => 2,
-            Error::Interrupted
-            | Error::Data(tce_data::DataError::Interrupted)
-            | Error::Sim(tce_sim::SimError::Interrupted)
-            | Error::Diffusion(tce_diffusion::DiffusionError::Interrupted { .. }) => 130,
+            Error::Interrupted(_) => Interrupted::EXIT_CODE,
             _ => 1,
         }
     }
 }
 
+/// An error of another crate is a case of its own here, but for an interruption, which is one case wherever it happened.
+macro_rules! taken_over {
+    ($($case:ident: $of:ident::$error:ident;)*) => {
+        $(
+            impl From<$of::$error> for Error {
+                fn from(error: $of::$error) -> Self {
+                    match error {
+                        $of::$error::Interrupted(reason) => Self::Interrupted(reason),
+                        error => Self::$case(error),
+                    }
+                }
+            }
+        )*
+    };
+}
+
+taken_over! {
+    Data: tce_data::DataError;
+    Sim: tce_sim::SimError;
+    Diffusion: tce_diffusion::DiffusionError;
+}
+
 impl From<tce_augment::Error> for Error {
     fn from(error: tce_augment::Error) -> Self {
         match error {
-            tce_augment::Error::Data(error) => Self::Data(error),
+            tce_augment::Error::Data(error) => error.into(),
             tce_augment::Error::File(error) => Self::File(error),
             tce_augment::Error::Learn(error) => Self::Learn(error),
-            tce_augment::Error::Diffusion(error) => Self::Diffusion(error),
+            tce_augment::Error::Diffusion(error) => error.into(),
             tce_augment::Error::Failed(text) => Self::Failed(text),
-            tce_augment::Error::Interrupted => Self::Interrupted,
+            tce_augment::Error::Interrupted(reason) => Self::Interrupted(reason),
         }
     }
 }
@@ -84,8 +110,8 @@ impl From<tce_zoo::Error> for Error {
     fn from(error: tce_zoo::Error) -> Self {
         match error {
             tce_zoo::Error::Usage(text) => Self::Usage(text),
-            tce_zoo::Error::Data(error) => Self::Data(error),
-            tce_zoo::Error::Sim(error) => Self::Sim(error),
+            tce_zoo::Error::Data(error) => error.into(),
+            tce_zoo::Error::Sim(error) => error.into(),
             tce_zoo::Error::File(error) => Self::File(error),
             tce_zoo::Error::Network(error) => Self::Network(error),
             tce_zoo::Error::Learn(error) => Self::Learn(error),

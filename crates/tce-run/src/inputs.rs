@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::Serialize;
 use tce_data::{
@@ -33,6 +34,22 @@ pub struct Inputs {
     pub actions: Option<ActionRange>,
     /// The collector's step limit, where the user gave one.
     limit: Option<usize>,
+}
+
+/// Which data a stage looks at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Domains {
+    /// The target's alone.
+    Target,
+    /// Those of both domains, where there is a source.
+    Both,
+}
+
+impl Domains {
+    /// Both, if the source is needed.
+    pub fn with_source(needed: bool) -> Self {
+        if needed { Self::Both } else { Self::Target }
+    }
 }
 
 /// What identifies the inputs in a specification.
@@ -75,13 +92,14 @@ impl Inputs {
     /// The same with rows in memory, which were checked when they were read ([`tce_data::load`], [`tce_data::from_columns`]). A number of
     /// `origin` per row of `extra` tells which of them are target rows (0), as in a file of `tce augment`.
     pub fn of_rows(
-        source: Option<Transitions>,
-        target: Transitions,
-        extra: Option<(Transitions, Option<&[f32]>)>,
+        source: Option<Arc<Transitions>>,
+        target: Arc<Transitions>,
+        extra: Option<(Arc<Transitions>, Option<&[f32]>)>,
         own: &Own,
     ) -> Result<Self> {
-        let (target, source) = (Table::in_memory(target, "target"), source.map(|rows| Table::in_memory(rows, "source")));
-        let besides = |(rows, origin): (Transitions, Option<&[f32]>)| {
+        let (target, source) =
+            (Table::in_memory(target, "target"), source.map(|rows| Table::in_memory(rows, "source")));
+        let besides = |(rows, origin): (Arc<Transitions>, Option<&[f32]>)| {
             let Table { rows, hash, complete, .. } = Table::in_memory(rows, "extra");
             Table::without_target(complete.unwrap_or(rows), origin, Path::new("extra"), hash, &target)
         };
@@ -242,9 +260,9 @@ impl Inputs {
     }
 
     /// [`Inputs::spec`] of work that sees the imitated rows alone.
-    pub fn spec_imitated(&self, with_source: bool, config: &TargetConfig) -> InputSpec {
+    pub fn spec_imitated(&self, domains: Domains, config: &TargetConfig) -> InputSpec {
         let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
-        InputSpec { chosen, ..self.spec(with_source) }
+        InputSpec { chosen, ..self.spec(domains) }
     }
 
     /// Refuses files that do not fit, and brings all tables into the box.
@@ -296,13 +314,13 @@ impl Inputs {
         tables.map(|t| std::path::absolute(&t.file).unwrap_or_else(|_| t.file.clone())).collect()
     }
 
-    /// What identifies these inputs; with `source` left out for stages that do not look at it.
-    pub fn spec(&self, with_source: bool) -> InputSpec {
+    /// What identifies these inputs; without the source for stages that do not look at it.
+    pub fn spec(&self, domains: Domains) -> InputSpec {
         InputSpec {
             agent: self.agent,
             shift: self.shift,
             target: self.target.hash.clone(),
-            source: self.source.as_ref().filter(|_| with_source).map(|s| s.hash.clone()),
+            source: self.source.as_ref().filter(|_| domains == Domains::Both).map(|s| s.hash.clone()),
             chosen: None,
             actions: self.actions.clone(),
             step_limit: self.limit,

@@ -1,4 +1,4 @@
-//! What a fit keeps in the attempt at a stage: checkpoints, metrics, sampled chunks and the networks at the ends of cycles.
+//! Stores the products of a fit in the attempt at a stage: checkpoints, metrics, sampled chunks and the networks at the ends of cycles.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -34,12 +34,12 @@ impl Keeper for Kept<'_> {
         Ok(())
     }
 
-    fn record(&self, name: &str, step: u64, figure: &'static str, values: &[f64]) {
+    fn record(&self, name: &str, step: u64, metric: &'static str, values: &[f64]) {
         let mut metrics = self.metrics.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(metrics) = metrics.as_mut() else { return };
         for (m, &value) in values.iter().enumerate() {
             // A metric that cannot be written must not cost the training.
-            let _ = metrics.log(name, step, m, [(figure, value)]);
+            let _ = metrics.log(name, step, m, [(metric, value)]);
         }
     }
 

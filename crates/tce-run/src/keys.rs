@@ -1,5 +1,5 @@
-//! What a key of the configuration is: from the comments of its field and their ranges ([`Config`] and the types in it, by
-//! `schemars`), from the presets, and from what the presets say beside their values.
+//! Explanations of configuration keys. They come from doc comments and ranges of the fields ([`Config`], read by `schemars`), from the
+//! presets, and from comments in the presets.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -8,7 +8,7 @@ use crate::config::Config;
 use crate::error::Result;
 use crate::layers::{Layered, Preset};
 
-/// Everything that is known of a key.
+/// The explanation of a key.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Explanation {
     /// The key.
@@ -19,17 +19,17 @@ pub struct Explanation {
     pub from: String,
     /// Its value in every preset; None where a preset has no such key.
     pub presets: Vec<(&'static str, Option<String>)>,
-    /// What values it takes, in words.
+    /// The type of its values, in words.
     pub kind: String,
-    /// The words that it takes, and what they mean.
+    /// The words that it accepts, with their meaning.
     pub choices: Vec<(String, String)>,
-    /// The numbers that it takes; None where its type says all.
+    /// The range of its numbers; None where the type says all.
     pub range: Option<String>,
     /// What it does.
     pub what: String,
-    /// Where its value is from: a table or equation of the paper, a method's authors, or our own.
+    /// Origin of its value: a table or equation of the paper, a method's authors, or our own.
     pub source: Option<String>,
-    /// What presets say beside its value or its table, with the preset.
+    /// Comments of presets on its value or its table, with the preset.
     pub notes: Vec<(&'static str, String)>,
 }
 
@@ -158,7 +158,7 @@ fn plain(x: f64) -> String {
     if x.abs() >= 1e7 { format!("{x:e}") } else { x.to_string() }
 }
 
-/// The words of a comment, and what stands behind `Source:`.
+/// The text of a comment before and after `Source:`.
 fn sentences(description: &str) -> (String, Option<String>) {
     // Links and line breaks are for rustdoc, and so is everything after the first paragraph.
     let first = description.split("\n\n").next().unwrap_or_default();
@@ -169,7 +169,7 @@ fn sentences(description: &str) -> (String, Option<String>) {
     }
 }
 
-/// What a preset's file says beside the value of `key`, or beside the table that it is in.
+/// The comment of a preset's file on the value of `key`, or on its table.
 fn notes(toml: &str, key: &str) -> Vec<String> {
     let (mut table, mut last) = (String::new(), String::new());
     let mut found: Vec<(String, String)> = Vec::new();

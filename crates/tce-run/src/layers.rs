@@ -1,6 +1,6 @@
-//! Where a configuration comes from: layers of TOML, each value remembered with the layer it comes from.
+//! Layers of TOML that make a configuration. Each value is stored with the layer that set it.
 //!
-//! Layers, the later winning: the `default` preset (which lists every key), the chosen preset, the paper's task-specific
+//! Layers, from the lowest to the highest: the `default` preset (which lists every key), the chosen preset, the paper's task-specific
 //! values (preset `paper` only), the variant, the user's file, `--set key=value`. A table with a `kind` (a process, a
 //! sampler) is one value: another kind replaces it whole.
 
@@ -30,7 +30,7 @@ const QUICK: &str = include_str!("../presets/quick.toml");
 pub enum Preset {
     /// Appendix B and Tables C.4, C.5 as written.
     Paper,
-    /// What measures best with one setting for all tasks.
+    /// The settings that measure best, the same for all tasks.
     #[default]
     Default,
     /// `default`, sized to finish in minutes on two cores.
@@ -126,7 +126,7 @@ impl Layered {
         Ok(layered)
     }
 
-    /// Eq. 10 is TCE's: rivals that stand on IQL as it is have no such term, unless it comes from somewhere else than `presets`.
+    /// Eq. 10 is TCE's: prior methods that build on plain IQL have no such term, unless it comes from somewhere else than `presets`.
     fn without_tce_regulariser(&mut self, presets: &[&str]) -> Result<()> {
         let algorithm = self.table["learner"].get("algorithm").and_then(Value::as_str).unwrap_or_default().to_owned();
         let key = "learner.iql.regulariser";
@@ -185,10 +185,22 @@ impl Layered {
 }
 
 fn parse(text: &str, name: &str) -> Result<Table> {
-    text.parse::<Table>().map_err(|e| Error::Usage(format!("{name}: not TOML: {}", e.to_string().trim_end())))
+    let parsed = text.parse::<Table>();
+    let mut table = parsed.map_err(|e| Error::Usage(format!("{name}: not TOML: {}", e.to_string().trim_end())))?;
+    with_current_names(&mut table);
+    Ok(table)
 }
 
-/// `learner.steps=1000` as a table; what is no TOML value is a string.
+/// Renames tables that earlier versions called otherwise: `joint` is `single_stage`.
+pub(crate) fn with_current_names(table: &mut Table) {
+    if !table.contains_key("single_stage")
+        && let Some(value) = table.remove("joint")
+    {
+        table.insert("single_stage".to_owned(), value);
+    }
+}
+
+/// `learner.steps=1000` as a table; a value that is not TOML is a string.
 fn parse_set(set: &str) -> Result<Table> {
     let (key, value) = set.split_once('=').ok_or_else(|| Error::Usage(format!("--set {set}: expected key=value")))?;
     let value = format!("v = {value}").parse::<Table>().ok().and_then(|mut t| t.remove("v"));
@@ -197,7 +209,10 @@ fn parse_set(set: &str) -> Result<Table> {
         value = Value::Table(Table::from_iter([(part.to_owned(), value)]));
     }
     match value {
-        Value::Table(table) => Ok(table),
+        Value::Table(mut table) => {
+            with_current_names(&mut table);
+            Ok(table)
+        }
         _ => Err(Error::Usage(format!("--set {set}: expected key=value"))),
     }
 }
@@ -300,7 +315,7 @@ impl ConfigArgs {
         own
     }
 
-    /// Whether nothing was said.
+    /// Whether no argument was given.
     pub fn is_empty(&self) -> bool {
         self.preset == Preset::default() && self.config.is_none() && self.sets.is_empty()
     }
@@ -330,7 +345,41 @@ mod tests {
         assert_eq!(config.generator, GeneratorConfig::recommended());
         assert_eq!(config.filter, FilterConfig::recommended());
         assert_eq!(config.labels, LabelsConfig::recommended());
-        assert_eq!(config.joint, SingleStageConfig::recommended());
+        assert_eq!(config.single_stage, SingleStageConfig::recommended());
+    }
+
+    /// The library's settings of the paper are the preset's.
+    #[test]
+    fn the_library_has_the_paper_preset() {
+        use tce_learn::cvae::CvaeConfig;
+        use tce_learn::pair_model::PairInput;
+        use tce_learn::{BcConfig, IqlConfig, LabelConfig};
+        let paper = layered(Preset::Paper, None, &[]).unwrap().config().unwrap();
+        let term = IqlConfig { regulariser: RegulariserKind::ForwardKl, ..IqlConfig::paper() };
+        assert_eq!(paper.learner.iql, term);
+        assert_eq!(paper.learner.behaviour.cvae, CvaeConfig::paper());
+        let mut labels = LabelConfig::paper();
+        (labels.model.input, labels.model.cosine) = (PairInput::Next, false);
+        assert_eq!(paper.labels.training, labels);
+        assert_eq!(paper.learner.bc, BcConfig::default(), "one clone with the networks of IQL's policy");
+    }
+
+    /// What the program's own defaults say of a learner is what the default preset says; clones are the exception, see above.
+    #[test]
+    fn defaults_of_learners_are_those_of_the_default_preset() {
+        let learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;
+        let preset = serde_json::to_value(&learner).unwrap();
+        for (name, table) in default_tables().into_iter().filter(|(name, _)| *name != "bc") {
+            let own = serde_json::to_value(table).unwrap();
+            let (own, preset) = (own.as_object().unwrap(), preset[name].as_object().unwrap());
+            for (key, value) in own {
+                let same = match (value.as_f64(), preset[key].as_f64()) {
+                    (Some(a), Some(b)) => (a - b).abs() <= 1e-6 * a.abs(),
+                    _ => *value == preset[key],
+                };
+                assert!(same, "{name}.{key}: {value} and {}", preset[key]);
+            }
+        }
     }
 
     #[test]
@@ -385,17 +434,30 @@ mod tests {
         assert_eq!(origin("learner.iql.expectile"), "preset default");
     }
 
-    /// The behaviour term is TCE's. Rivals have one of their own or none, unless somebody asks for it.
+    /// The behaviour term is TCE's. Prior methods have one of their own or none, unless somebody asks for it.
     #[test]
-    fn rivals_have_no_term_of_tce() {
+    fn prior_methods_have_no_term_of_tce() {
         let regulariser =
             |sets: &[&str]| layered(Preset::Quick, None, sets).unwrap().config().unwrap().learner.iql.regulariser;
         assert_eq!(regulariser(&[]), RegulariserKind::ForwardKl);
-        for rival in ["dara", "srpo", "igdf"] {
-            let algorithm = format!("learner.algorithm={rival}");
+        for method in ["dara", "srpo", "igdf"] {
+            let algorithm = format!("learner.algorithm={method}");
             assert_eq!(regulariser(&[&algorithm]), RegulariserKind::None);
             assert_eq!(regulariser(&[&algorithm, "learner.iql.regulariser=forward_kl"]), RegulariserKind::ForwardKl);
         }
+    }
+
+    /// `[single_stage]` was `[joint]`: files, `--set` and keys of runs from then stay good.
+    #[test]
+    fn the_old_name_of_a_table_is_read() {
+        let config = |set: &str| layered(Preset::Default, None, &[set]).unwrap().config().unwrap();
+        let (old, new) = (config("joint.steps=7"), config("single_stage.steps=7"));
+        assert_eq!((old.single_stage.steps, &old), (7, &new));
+        assert!(new.to_toml().contains("\n[single_stage.guidance]") && !new.to_toml().contains("joint"));
+        let keyed = new.to_keyed_toml();
+        assert!(keyed.contains("\n[joint]\n") && !keyed.contains("single_stage"));
+        assert_eq!(toml::from_str::<Config>(&keyed).unwrap(), new);
+        assert!(serde_json::to_value(&new).unwrap().get("joint").is_some(), "what keys are hashed from");
     }
 
     #[test]

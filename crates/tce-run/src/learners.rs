@@ -19,7 +19,7 @@ use toy::ToyConfig;
 macro_rules! learners {
     ($($variant:ident($what:literal) => $table:ident $(: $config:ident($keys:literal))?;)*) => {
         /// Which algorithm learns the policy; what each of them is, `tce learn --list` tells.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, clap::ValueEnum, schemars::JsonSchema)]
         #[serde(rename_all = "kebab-case")]
         pub enum Algorithm {
             $(#[doc = $what] $variant,)*
@@ -41,7 +41,7 @@ macro_rules! learners {
             /// Share of the best trajectories that `bc` clones. 1: all of them. Source: "BC-10 %" of Chen et al.
             #[schemars(range(min = 0.001, max = 1.0))]
             pub top: f64,
-            /// Implicit Q-learning, and what the rivals that stand on it take from it.
+            /// Implicit Q-learning, and what the prior methods that stand on it take from it.
             pub iql: IqlConfig,
             $($(
                 // Runs that were done before there was this method have no such table.
@@ -95,7 +95,7 @@ macro_rules! learners {
 /// The default configuration of a table's method.
 macro_rules! fresh {
     (iql) => {
-        IqlConfig::default()
+        IqlConfig::paper()
     };
     ($table:ident $config:ident) => {
         $config::default()
@@ -135,7 +135,7 @@ impl Algorithm {
 
     /// Whether it stands on IQL as `learner.iql` has it, without being IQL.
     pub fn stands_on_plain_iql(self) -> bool {
-        let iql = IqlConfig::default();
+        let iql = IqlConfig::paper();
         self != Self::Iql && self.fresh().backbone(&iql) == Some(iql)
     }
 }

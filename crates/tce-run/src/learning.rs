@@ -10,18 +10,18 @@ use tce_base::metrics::{Line, Metrics};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions, even_standardizer};
 use tce_learn::{
-    Buffer, Journal, Lane, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, best_trajectories,
+    Buffer, Journal, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, TrainingJob, best_trajectories,
     return_range_scale, train_side_by_side,
 };
 use tce_nn::{Device, is_cpu};
 use tce_sim::SimError;
-use tce_zoo::actors::{Arena, Evaluation, evaluate};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 use crate::inputs::Inputs;
 use crate::methods::build;
-use crate::processor::Processor;
 
 /// The data of one member: target rows, and perhaps others.
 #[derive(Clone, Debug)]
@@ -53,29 +53,30 @@ pub fn save_policies(policies: &[Policy], seeds: &[u64], directory: &Path, input
     policies.iter().zip(seeds).map(save).collect()
 }
 
-/// What learning leaves behind besides the policies.
+/// The results of a training besides the policies.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
     /// Evaluation of the last checkpoint, per member; empty without a simulator.
     pub evaluations: Vec<Evaluation>,
-    /// Means of the learner's figures over its last report, per member; None is a number that is not finite.
-    pub figures: BTreeMap<String, Vec<Option<f64>>>,
+    /// Means of the learner's metrics over its last report, per member; None is a number that is not finite.
+    #[serde(alias = "figures")]
+    pub metrics: BTreeMap<String, Vec<Option<f64>>>,
     /// Seconds of training.
     pub seconds: f64,
-    /// What computed it.
+    /// The device that computed it.
     #[serde(default)]
-    pub device: Processor,
+    pub device: DeviceKind,
 }
 
 impl Learned {
-    /// The normalised scores, per member; None where a policy could not be judged.
+    /// The normalised scores, per member; None where a policy could not be evaluated.
     pub fn scores(&self) -> Vec<Option<f64>> {
         self.evaluations.iter().map(|e| e.score).collect()
     }
 }
 
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
-/// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a word that stands for all that decides the result. `keep` gets the policies before they are judged, so that what hours of training gave is on disk
+/// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a cache key: the hash of all inputs. `keep` gets the policies before they are evaluated, so that what hours of training gave is on disk
 /// whatever happens then.
 pub fn learn(
     data: Vec<MemberData>,
@@ -90,15 +91,15 @@ pub fn learn(
     let mixed = data.iter().any(|d| d.extra.is_some());
     let config = &LearnerConfig { steps: config.steps(mixed), ..config.clone() };
     let journal = Journal::default();
-    let place = Place { directory: Some(directory), key, lane: 0, journal: Some(&journal) };
+    let place = Place { directory: Some(directory), key, job: 0, journal: Some(&journal) };
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
     let size = if is_cpu(device) { 1 } else { data.len().max(1) };
-    let start = |(lane_number, data)| lane(data, config, Place { lane: lane_number, ..place }, device);
-    let lanes = data.par_chunks(size).enumerate().map(start).collect::<Result<Vec<_>>>()?;
+    let start = |(job_number, data)| job(data, config, Place { job: job_number, ..place }, device);
+    let jobs = data.par_chunks(size).enumerate().map(start).collect::<Result<Vec<_>>>()?;
     drop(data);
-    let (buffers, mut learners): (Vec<_>, Vec<_>) = lanes.into_iter().unzip();
-    let mut lanes: Vec<_> =
-        learners.iter_mut().zip(&buffers).map(|(l, buffer)| Lane { learner: l.as_mut(), buffer }).collect();
+    let (buffers, mut learners): (Vec<_>, Vec<_>) = jobs.into_iter().unzip();
+    let mut jobs: Vec<_> =
+        learners.iter_mut().zip(&buffers).map(|(l, buffer)| TrainingJob { learner: l.as_mut(), buffer }).collect();
     let updates = config.steps;
     let steps = Steps::new(updates, (updates / 50).max(1));
     let label = format!("learn {} {seeds:?}", config.algorithm.about().name);
@@ -106,29 +107,29 @@ pub fn learn(
     let due = |step: u64| step < updates && step.checked_div(evaluation.every).is_some_and(|k| k > 0);
     let mut checkpoints = place.checkpoints("learner")?;
     let from = checkpoints.step().unwrap_or(0);
-    // What was trained before the first step is told whole at every start.
+    // Metrics of preparations are written again at every start.
     let before = journal.take();
-    let before = before.iter().flat_map(|(lane, training, report)| lines(training, report, lane * size)).collect();
+    let before = before.iter().flat_map(|(job, training, report)| lines(training, report, job * size)).collect();
     let metrics = &mut Metrics::resume_behind(directory, before, |stage, at| {
         at <= from && ["learn", "evaluate"].contains(&stage)
     })?;
-    // The number of the last evaluation, which came with the last report.
+    // The last evaluation came with the last report.
     let number = |step: u64| step.checked_div(evaluation.every).unwrap_or(0);
-    let mut judged = vec![number(from - from % steps.report_every); lanes.len()];
-    let outcome = train_side_by_side(&mut lanes, steps, &label, &mut checkpoints, device, |k, report, learner| {
+    let mut evaluated = vec![number(from - from % steps.report_every); jobs.len()];
+    let outcome = train_side_by_side(&mut jobs, steps, &label, &mut checkpoints, device, |k, report, learner| {
         for line in lines("learn", report, k * size) {
             metrics.write(&line)?;
         }
         for (name, values) in &report.metrics {
-            let figures = learned.figures.entry(name.clone()).or_insert_with(|| vec![None; seeds.len()]);
-            for (figure, value) in figures[k * size..].iter_mut().zip(values) {
-                *figure = value.is_finite().then_some(*value);
+            let means = learned.metrics.entry(name.clone()).or_insert_with(|| vec![None; seeds.len()]);
+            for (mean, value) in means[k * size..].iter_mut().zip(values) {
+                *mean = value.is_finite().then_some(*value);
             }
         }
         let number = number(report.step);
-        if let (Some(arena), true) = (arena, due(report.step) && number > judged[k]) {
-            judged[k] = number;
-            let evaluations = judge(&learner.policies(), &seeds[k * size..], evaluation.episodes, arena)?;
+        if let (Some(arena), true) = (arena, due(report.step) && number > evaluated[k]) {
+            evaluated[k] = number;
+            let evaluations = evaluate_all(&learner.policies(), &seeds[k * size..], evaluation.episodes, arena)?;
             for (m, e) in evaluations.iter().enumerate() {
                 metrics.log("evaluate", report.step, k * size + m, e.score.map(|s| ("score", s)))?;
             }
@@ -136,12 +137,12 @@ pub fn learn(
         Ok::<_, Error>(())
     })?;
     if outcome.interrupted {
-        return Err(Error::Interrupted);
+        return Err(Error::interrupted());
     }
     let policies: Vec<Policy> = learners.iter().flat_map(|l| l.policies()).collect();
     keep(&policies)?;
     if let Some(arena) = arena {
-        learned.evaluations = judge(&policies, &seeds, evaluation.episodes, arena)?;
+        learned.evaluations = evaluate_all(&policies, &seeds, evaluation.episodes, arena)?;
         for (m, e) in learned.evaluations.iter().enumerate() {
             metrics.log("evaluate", updates, m, e.score.map(|s| ("score", s)))?;
         }
@@ -155,12 +156,12 @@ pub fn learn(
 /// A report of `stage` on members `first` and following.
 fn lines<'a>(stage: &'a str, report: &'a Report, first: usize) -> impl Iterator<Item = Line> + use<'a> {
     let members = report.metrics.values().map(Vec::len).max().unwrap_or(0);
-    let figures = move |m| report.metrics.iter().map(move |(name, v): (&String, &Vec<f64>)| (name.as_str(), v[m]));
-    (0..members).map(move |m| Line::new(stage, report.step, first + m, figures(m)))
+    let values = move |m| report.metrics.iter().map(move |(name, v): (&String, &Vec<f64>)| (name.as_str(), v[m]));
+    (0..members).map(move |m| Line::new(stage, report.step, first + m, values(m)))
 }
 
 /// The members of `data` as one training, before its first step.
-fn lane(
+fn job(
     data: &[MemberData],
     config: &LearnerConfig,
     place: Place<'_>,
@@ -199,18 +200,18 @@ fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
 }
 
 /// Evaluates every member's policy with the member's own streams.
-fn judge(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Arena) -> Result<Vec<Evaluation>> {
+fn evaluate_all(policies: &[Policy], seeds: &[u64], episodes: usize, arena: Arena) -> Result<Vec<Evaluation>> {
     policies
         .par_iter()
         .zip(seeds)
         .map(|(p, &seed)| {
-            match evaluate(p, arena, episodes, Streams::new(seed), true, interrupted) {
-                // One member that has diverged must not cost the others their result.
+            match evaluate(p, arena, episodes, Streams::new(seed), Actions::Mean, interrupted) {
+                // If one member has diverged, the others keep their results.
                 Err(tce_zoo::Error::Sim(e @ SimError::NotFinite { .. })) => {
                     tce_base::note!("seed {seed}: {e}; it has no score");
                     Ok(Evaluation::failed(e.to_string()))
                 }
-                judged => Ok(judged?),
+                evaluations => Ok(evaluations?),
             }
         })
         .collect()

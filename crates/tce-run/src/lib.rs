@@ -1,13 +1,24 @@
-//! What makes a run and keeps it: configurations and their layers, stages, the pipeline, verdicts, diagnoses and sweeps.
+//! Runs: configuration, presets and variants, stages with their files, the pipeline, verdicts, diagnoses and sweeps.
+//!
+//! | question | module |
+//! |---|---|
+//! | Which settings are there, and where does a value come from? | [`config`], [`layers`], [`keys`], [`variant`] |
+//! | Which learners are there? | [`learners`] |
+//! | What is stored, and when is work done? | [`stage`], [`kept`] |
+//! | A whole run of the benchmark? | [`pipeline`] |
+//! | A training on own tables? | [`training_run`] |
+//! | Generated rows? | [`augment`], [`mixture`] |
+//! | Which policy is best, without a simulator? | [`off_policy_evaluation`], [`verdict`] |
+//! | Can generated rows be trusted? | [`diagnosis`] |
+//! | Many runs? | [`sweep`], [`study`] |
 
-pub mod augmentation;
+pub mod augment;
 pub mod config;
 pub mod course;
+pub mod device_kind;
 pub mod diagnosis;
 pub mod error;
-pub mod expand;
 pub mod inputs;
-pub mod judge;
 pub mod kept;
 pub mod keys;
 pub mod layers;
@@ -15,9 +26,9 @@ pub mod learners;
 pub mod learning;
 pub mod methods;
 pub mod mixture;
+pub mod off_policy_evaluation;
 pub mod own;
 pub mod pipeline;
-pub mod processor;
 pub mod recipe;
 pub mod stage;
 pub mod study;

@@ -22,20 +22,20 @@ pub fn build(
 ) -> Result<Box<dyn PolicyLearner>> {
     let LearnerConfig { steps, iql, behaviour, .. } = config;
     let on = Setup { buffer, steps: *steps, iql, behaviour, place, device };
-    config.own().build(&on)?.ok_or(Error::Interrupted)
+    config.own().build(&on)?.ok_or_else(Error::interrupted)
 }
 
-/// The number of every row of `others` that the learner of `config` chooses by, the greater the closer to the target; None if it
-/// chooses by none that is computed before.
+/// One score per row of `others`, for learners that choose rows by scores; a higher score is closer to the target. None for other
+/// learners.
 ///
 /// # Errors
 /// If there are too few rows, or the user interrupts it.
 pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -> Result<Option<Arc<Vec<f32>>>> {
     let (rows, near) = (Rows::transitions(others), Rows::transitions(target));
     Ok(match config.learner.algorithm.about().scores {
-        RowScores::Transport => Some(closeness(transport_costs(&rows, &near, &TransportOptions::default())?)),
+        RowScores::Transport => Some(negated_costs(transport_costs(&rows, &near, &TransportOptions::default())?)),
         RowScores::Density => {
-            let options = &config.joint.scores;
+            let options = &config.single_stage.scores;
             enough_to_score(others.len(), target.len(), options)?;
             Some(Arc::new(density_scores(&rows, &near, options, &score_streams())?.source))
         }
@@ -43,7 +43,7 @@ pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -
     })
 }
 
-/// -cost: the greater the closer.
-pub fn closeness(costs: Vec<f32>) -> Arc<Vec<f32>> {
+/// Costs as scores: higher is closer.
+pub fn negated_costs(costs: Vec<f32>) -> Arc<Vec<f32>> {
     Arc::new(costs.into_iter().map(|c| -c).collect())
 }

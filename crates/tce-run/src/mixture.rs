@@ -23,7 +23,7 @@ use tce_nn::{NamedParameters, cpu};
 
 use crate::config::{Config, SourceRows};
 use crate::error::{Error, Result};
-use crate::inputs::Inputs;
+use crate::inputs::{Domains, Inputs};
 use crate::stage::Stage;
 
 /// The rows of a mixture that are not target rows, per member; `None` for target rows alone. `source_scores` are numbers of all
@@ -81,14 +81,15 @@ struct DistanceSpec {
     kind: SourceRows,
 }
 
-/// One number per source row, the smaller the closer to the target; computed once per pair of data sets.
+/// One distance per source row to the target; computed once per pair of data sets.
 pub fn distances(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<Vec<f32>> {
     Ok(distances_stage(inputs, kind, root)?.0)
 }
 
 /// [`distances`], and the directory where they are.
 pub fn distances_stage(inputs: &Inputs, kind: SourceRows, root: &Path) -> Result<(Vec<f32>, PathBuf)> {
-    let stage = Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(true), kind }, &cpu())?;
+    let stage =
+        Stage::open(root, "stages/distances", &DistanceSpec { inputs: inputs.spec(Domains::Both), kind }, &cpu())?;
     let file = stage.file("distances.safetensors");
     if stage.summary::<usize>()?.is_some() {
         let mut loaded = NamedParameters::load(&file)?;

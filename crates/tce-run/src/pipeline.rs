@@ -1,4 +1,4 @@
-//! One variant on one pair of data sets, from rows to scores, in a directory that holds everything about it.
+//! A run: one variant on one pair of data sets, from rows to scores, in one directory.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,13 +12,13 @@ use tce_learn::{DynamicsConfig, Mode, RowScores};
 use tce_nn::Device;
 use tce_zoo::actors::{Arena, Evaluation};
 
+use crate::augment::single_stage;
+use crate::augment::{Generated, augment_rows, label_models};
 use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
-use crate::expand::single_stage;
-use crate::expand::{Generated, expand, label_models};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
-use crate::methods::{closeness, row_scores};
+use crate::methods::{negated_costs, row_scores};
 use crate::mixture::{distances, extra_rows};
 use crate::stage::Stage;
 
@@ -32,7 +32,7 @@ pub struct Summary {
     pub mode: Option<Mode>,
     /// The seeds, one member each.
     pub seeds: Vec<u64>,
-    /// Normalised score per seed; None if its policy could not be judged. Empty without a simulator.
+    /// Normalised score per seed; None if its policy could not be evaluated. Empty without a simulator.
     pub scores: Vec<Option<f64>>,
     /// Learning and evaluation.
     pub learned: Learned,
@@ -40,9 +40,9 @@ pub struct Summary {
     pub extra_rows: usize,
     /// The generated rows, per member; empty if there are none.
     pub generated: Vec<Generated>,
-    /// Seconds from data to scores, without stages that were there already.
+    /// Seconds from data to scores, without stages that were finished before.
     pub seconds: f64,
-    /// Where everything is.
+    /// The directory of the run.
     pub directory: PathBuf,
     /// The files of the target's and the source's rows, if it had any, as they were called at the time.
     #[serde(default)]
@@ -56,7 +56,7 @@ impl Summary {
     }
 }
 
-/// What decides a run's result: what a variant does not use is left out, so that floors are shared between presets.
+/// The inputs of a run's key. Settings that the variant does not use are left out, so that presets share baselines.
 #[derive(Serialize)]
 struct RunSpec<'a> {
     inputs: InputSpec,
@@ -77,7 +77,7 @@ impl<'a> RunSpec<'a> {
         let two_stages = config.mixture.generated == GeneratedRows::Tce;
         let relabelled = config.mixture.source == SourceRows::Relabelled;
         Self {
-            inputs: inputs.spec_imitated(config.needs_source(), &config.target),
+            inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
             mixture: &config.mixture,
             learner: config.learner.used(),
@@ -86,7 +86,7 @@ impl<'a> RunSpec<'a> {
             filter: two_stages.then_some(&config.filter),
             labels: (two_stages || relabelled).then_some(&config.labels),
             dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
-            joint: used_of_single_stage(&config.joint, config.mixture.generated, config.learner.algorithm),
+            joint: used_of_single_stage(&config.single_stage, config.mixture.generated, config.learner.algorithm),
         }
     }
 }
@@ -134,9 +134,11 @@ impl Config {
     /// The number of every source row by which the learner chooses, where it is computed once for all seeds.
     fn source_scores(&self, inputs: &Inputs, root: &Path) -> Result<Option<Arc<Vec<f32>>>> {
         match self.row_scores() {
-            RowScores::Density => Ok(Some(Arc::new(single_stage::scores(inputs, &self.joint.scores, root)?.source))),
+            RowScores::Density => {
+                Ok(Some(Arc::new(single_stage::scores(inputs, &self.single_stage.scores, root)?.source)))
+            }
             RowScores::Transport if self.source_alone() => {
-                Ok(Some(closeness(distances(inputs, SourceRows::Transport, root)?)))
+                Ok(Some(negated_costs(distances(inputs, SourceRows::Transport, root)?)))
             }
             _ => Ok(None),
         }
@@ -170,10 +172,10 @@ pub fn run(
 
     let (mut reports, mut tables) = (Vec::new(), None);
     if generated {
-        let expansion = expand(inputs, config, seeds, root, device)?;
-        files.extend(expansion.link_into(&attempt)?);
-        reports = expansion.reports;
-        let scored = expansion.tables.into_iter().zip(expansion.scores);
+        let augmentation = augment_rows(inputs, config, seeds, root, device)?;
+        files.extend(augmentation.link_into(&attempt)?);
+        reports = augmentation.reports;
+        let scored = augmentation.tables.into_iter().zip(augmentation.scores);
         tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
     }
     let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
@@ -210,7 +212,7 @@ pub fn run(
         directory: stage.directory().to_owned(),
         data: inputs.files(),
     };
-    // Without times, so that two copies of a run have the same bytes.
+    // No times: two copies of a run have the same bytes.
     let result = "result.json".to_owned();
     write_json(
         &attempt.file(&result),
@@ -223,7 +225,7 @@ pub fn run(
 
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
-    // Who models the dynamics has no use for a terminal row without a successor.
+    // Models of the dynamics cannot use a terminal row without a successor.
     let target = match config.learner.algorithm.about().successors {
         true => inputs.imitated(&config.target),
         false => inputs.learned_from(&config.target),
@@ -231,9 +233,9 @@ fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds
     let target = Arc::new(target.into_owned());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
-        // Generated rows among them are no trajectories.
+        // Generated rows are no trajectories.
         let generated = config.mixture.generated != GeneratedRows::None;
-        trajectories.push(if generated { Arc::new(inputs.source_rows()?.clone()) } else { extra[0].rows.clone() });
+        trajectories.push(if generated { inputs.source()?.rows.clone() } else { extra[0].rows.clone() });
     }
     let scores = |rows: &ScoredRows| match &rows.scores {
         Some(scores) => Ok(Some(scores.clone())),

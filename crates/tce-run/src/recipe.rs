@@ -9,7 +9,7 @@ use tce_data::Task;
 use tce_report::{Budget, Recipe, RunFolder};
 
 use crate::config::Config;
-use crate::layers::{Layered, Preset};
+use crate::layers::{Layered, Preset, with_current_names};
 use crate::variant::Variant;
 
 /// A preset for a task and a variant.
@@ -41,7 +41,8 @@ fn flat(table: &toml::Table, prefix: &str, out: &mut BTreeMap<String, String>) {
 
 fn settings(text: &str) -> BTreeMap<String, String> {
     let mut out = BTreeMap::new();
-    if let Ok(table) = text.parse::<toml::Table>() {
+    if let Ok(mut table) = text.parse::<toml::Table>() {
+        with_current_names(&mut table);
         flat(&table, "", &mut out);
     }
     out
@@ -99,7 +100,10 @@ impl Recipes {
 
 #[cfg(test)]
 mod tests {
+    use tce_learn::Mode;
+
     use super::*;
+    use crate::config::Algorithm;
 
     fn task() -> Task {
         "hopper-morph:medium->expert".parse().unwrap()
@@ -117,7 +121,7 @@ mod tests {
     #[test]
     fn presets_are_recognised_by_their_settings() {
         for (preset, name) in [(Preset::Default, "default"), (Preset::Quick, "quick"), (Preset::Paper, "paper")] {
-            for variant in [Variant::TceOg, Variant::Bc, Variant::Igdf] {
+            for variant in [Variant::TceOg, Variant::Bc, Variant::Prior(Algorithm::Igdf, Mode::Corrected)] {
                 assert_eq!(found(preset, variant, &[]), Some((name.to_owned(), vec![])), "{variant}");
             }
         }

@@ -1,12 +1,12 @@
-//! Stages: a directory per finished piece of work, named by the hash of everything that decides its content.
+//! Stages: one directory per piece of work, named by the hash of all its inputs.
 //!
-//! A stage is done when its `done.json` exists, which lists what the stage holds. A run that needs a stage takes it if it is
-//! done and makes it otherwise; two runs with the same needs share it.
+//! A stage is done when its `done.json` exists. This file lists the files of the stage. A run uses a stage that is done, and does the
+//! work otherwise. Runs with the same inputs share it.
 //!
-//! Work happens in a directory of its own ([`Attempt`]), so that copies of a run do not meet: on a cluster, a job that was given up
-//! for dead may still be alive beside its successor. A new attempt takes over what an earlier one left: checkpoints, metrics and
-//! sampled chunks. The end of an attempt is one `link(2)` of a complete `done.json`: the first one wins. A later one with the same bytes
-//! changes nothing; one with other bytes is a fault of determinism, which is kept as `fault-*.json` and reported.
+//! Each process works in a directory of its own ([`Attempt`]): on a cluster, a job that was believed dead may still run beside its
+//! successor. A new attempt takes over checkpoints, metrics and sampled chunks of an
+//! earlier one. The end of an attempt is one `link(2)` of a complete `done.json`: the first one wins. A later one with the same bytes
+//! changes nothing; one with other bytes means that the work is not deterministic: it is kept as `fault-*.json` and reported.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -21,10 +21,10 @@ use tce_base::metrics::Metrics;
 use tce_base::{FileError, Owner, PROGRAM, link_first, read_if_there, sha256_file, sha256_hex, write_json};
 use tce_nn::{Checkpoints, Device};
 
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
-use crate::processor::Processor;
 
-/// Changes when the same specification would give other bytes.
+/// Version of the computation. Increase it when the same specification gives other bytes.
 const FORMAT: u32 = 4;
 /// Where attempts are, in a stage.
 pub(crate) const ATTEMPTS: &str = "attempts";
@@ -54,7 +54,7 @@ impl Stage {
     /// computes is a stage of its own: it has other bytes.
     pub fn open<S: Serialize>(root: &Path, name: &str, spec: &S, device: &Device) -> Result<Self> {
         let mut spec = serde_json::json!({ "format": FORMAT, "stage": name.rsplit('/').next(), "spec": spec });
-        Processor::from(device).sign(&mut spec);
+        DeviceKind::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let directory = root.join(format!("{name}-{}", &key[..12]));
         fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
@@ -127,8 +127,8 @@ impl Stage {
         }
     }
 
-    /// The last steps of the winning attempt, after its files are in place: metrics, which are for eyes and no part of the result,
-    /// and its end.
+    /// The last steps of the winning attempt, after its files are in place: copies the metrics, which are no part of the result,
+    /// and removes the attempt.
     fn clear(&self, attempt: &str) {
         let directory = self.directory.join(ATTEMPTS).join(attempt);
         self.place(attempt, std::iter::once(&"metrics.jsonl".to_owned()));
@@ -143,7 +143,7 @@ impl Stage {
         let _ = fs::remove_dir(self.directory.join(ATTEMPTS));
     }
 
-    /// Begins, or goes on with, the work of this stage.
+    /// Starts or resumes the work of this stage.
     ///
     /// # Errors
     /// If the directory cannot be made.
@@ -164,9 +164,9 @@ impl Stage {
         for (_, other) in others.into_iter().rev() {
             let dead = Owner::of(&other).is_some_and(|owner| owner.dead());
             match (taken, dead) {
-                // Its owner is dead, so that nobody else writes there; of two that want it, one gets it.
+                // Its owner is dead: nobody writes there. If two processes want it, one gets it.
                 (false, true) => taken = fs::rename(&other, &directory).is_ok(),
-                // Perhaps alive, on another machine say. A copy of the same training is at another point of the same way.
+                // Its owner may run on another machine. A copy of its work is a valid earlier state of the same training.
                 (false, false) => taken = copy(&other, &directory).is_ok(),
                 (true, true) => drop(fs::remove_dir_all(&other)),
                 (true, false) => {}

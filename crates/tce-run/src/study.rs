@@ -10,6 +10,7 @@ use serde_json::Value;
 use tce_base::FileError;
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
+use tce_learn::Mode;
 use tce_report::folder::Verdict;
 use tce_report::{Cost, Method, Missing, Recipe, Recommended, ReportError, Run, RunFolder, Study};
 
@@ -31,23 +32,44 @@ pub fn of_directory(directory: &Path) -> Result<Study> {
 
 /// A column; `config` is that of one of its runs, the variant's own without.
 fn method(variant: Variant, label: &str, config: Option<&Config>) -> Method {
-    let floor = Variant::FLOORS.contains(&variant);
+    let baseline = Variant::BASELINES.contains(&variant);
     let title = config.map_or_else(|| variant.own_title(), |c| variant.row_title(c));
     let (id, title) = match label {
-        "" => (variant.name(), title),
+        "" => (variant.name().to_owned(), title),
         label => (format!("{variant} {label}"), format!("{title}, {label}")),
     };
-    Method { id, title, variant: variant.name(), floor, plain: label.is_empty() }
+    Method {
+        id,
+        title,
+        variant: variant.name().to_owned(),
+        base: variant.base().to_owned(),
+        published: variant.mode() == Mode::Published,
+        baseline,
+        plain: label.is_empty(),
+    }
 }
 
-/// Floors first, and all four of them: a table without a floor shows that it lacks it.
+/// A column of runs that the user gave a `name`.
+fn named(id: &str, name: &str) -> Method {
+    Method {
+        id: id.to_owned(),
+        title: id.to_owned(),
+        variant: name.to_owned(),
+        base: name.to_owned(),
+        published: false,
+        baseline: false,
+        plain: false,
+    }
+}
+
+/// Baselines first, and all four of them: a table without a baseline shows that it lacks it.
 fn in_order(mut methods: Vec<Method>) -> Vec<Method> {
-    for floor in Variant::FLOORS {
-        if !methods.iter().any(|m| m.variant == floor.name()) {
-            methods.push(method(floor, "", None));
+    for baseline in Variant::BASELINES {
+        if !methods.iter().any(|m| m.variant == baseline.name()) {
+            methods.push(method(baseline, "", None));
         }
     }
-    let place = |m: &Method| Variant::FLOORS.iter().position(|f| f.name() == m.variant).unwrap_or(usize::MAX);
+    let place = |m: &Method| Variant::BASELINES.iter().position(|f| f.name() == m.variant).unwrap_or(usize::MAX);
     methods.sort_by_key(place);
     methods
 }
@@ -102,7 +124,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
                             memory: outcome.memory,
                         });
                         let variant = entry.variant.map(Variant::name).unwrap_or_default();
-                        let recipe = recipes.of(entry.task, &variant, &folder);
+                        let recipe = recipes.of(entry.task, variant, &folder);
                         add_runs(&mut study.runs, entry.task, &entry.column(), folder, &recipe);
                     }
                 }
@@ -112,10 +134,10 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     let networks = networks(&sweep.directory.join("runs"));
     study.costs.splice(0..0, networks.values().cloned());
     let mut at = networks.len();
-    for entry in sweep.entries().iter().filter(|e| e.kind == Kind::Expand) {
+    for entry in sweep.entries().iter().filter(|e| e.kind == Kind::Augment) {
         // Only its time is of interest here: the rows themselves are verified by whoever reads them.
         let Ok(Some(outcome)) = sweep.outcome(entry) else { continue };
-        // The record is of the whole expansion; the networks have a record of their own.
+        // The record is of the whole augmentation; the networks have a record of their own.
         let stage = sweep.directory.join(&outcome.place);
         let training = networks_of(&stage).and_then(|name| networks.get(&name)).map_or(0.0, |cost| cost.seconds);
         let rest = outcome.seconds - training;
@@ -246,7 +268,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         methods.push(match Variant::from_str(name, false) {
             Ok(variant) => Method { id: id.clone(), ..method(variant, label, config.as_ref()) },
             // A name of the user's own.
-            Err(_) => Method { id: id.clone(), title: id.clone(), variant: name.clone(), floor: false, plain: false },
+            Err(_) => named(id, name),
         });
     }
     let methods = in_order(methods);
@@ -380,6 +402,7 @@ fn networks_of(generated: &Path) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Algorithm;
     use crate::sweep::Manifest;
 
     #[test]
@@ -394,10 +417,10 @@ mod tests {
     #[test]
     fn a_column_is_called_what_its_runs_are() {
         let mut config = Variant::TceOg.own();
-        config.learner.algorithm = crate::config::Algorithm::Td3Bc;
+        config.learner.algorithm = Algorithm::Td3Bc;
         assert_eq!(method(Variant::TceOg, "", Some(&config)).title, "TCE(OG), td3-bc");
         assert_eq!(method(Variant::TceOg, "y0.1", None).title, "TCE(OG), y0.1");
-        assert_eq!(method(Variant::DmcPublished, "", None).title, "DmC (published)");
+        assert_eq!(method(Variant::Prior(Algorithm::Dmc, Mode::Published), "", None).title, "DmC (published)");
     }
 
     /// What another version planned can be reported, though not run.
@@ -416,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn all_floors_come_first() {
+    fn all_baselines_come_first() {
         let some = [(Variant::TceOg, ""), (Variant::Bc, "y0.1"), (Variant::BcRaw, "")];
         let methods = in_order(some.map(|(variant, label)| method(variant, label, None)).to_vec());
         let ids: Vec<&str> = methods.iter().map(|m| m.id.as_str()).collect();

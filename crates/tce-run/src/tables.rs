@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::Serialize;
 use tce_base::{sha256_file, sha256_parts};
@@ -17,9 +18,9 @@ const LEAST_ROWS: usize = 10;
 #[derive(Debug)]
 pub struct Table {
     /// The rows whose successor is known.
-    pub rows: Transitions,
+    pub rows: Arc<Transitions>,
     /// All rows, where there are terminal ones without a successor among them.
-    pub(crate) complete: Option<Transitions>,
+    pub(crate) complete: Option<Arc<Transitions>>,
     /// All rows' actions as the file has them, where they were scaled.
     pub(crate) own_actions: Option<Vec<f32>>,
     /// The file.
@@ -74,12 +75,12 @@ impl Table {
     pub(crate) fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
         let options = LoadOptions { all_columns: true, ..options.clone() };
         let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
-        Self::without_target(transitions, columns.get("origin").map(Vec::as_slice), path, hash, target)
+        Self::without_target(transitions.into(), columns.get("origin").map(Vec::as_slice), path, hash, target)
     }
 
     /// The rows that are not the target's: neither marked by `origin` as such, nor equal to one.
     pub(crate) fn without_target(
-        rows: Transitions,
+        rows: Arc<Transitions>,
         origin: Option<&[f32]>,
         file: &Path,
         hash: String,
@@ -113,15 +114,20 @@ impl Table {
     }
 
     /// Rows that are in memory; `name` stands for the file.
-    pub(crate) fn in_memory(rows: Transitions, name: &str) -> Self {
+    pub(crate) fn in_memory(rows: Arc<Transitions>, name: &str) -> Self {
         let hash = content_hash(&rows);
         Self::new(rows, Path::new(name), hash)
     }
 
-    pub(crate) fn new(rows: Transitions, file: &Path, hash: String) -> Self {
-        let (rows, complete) = match rows.with_successors() {
-            Cow::Borrowed(_) => (rows, None),
-            Cow::Owned(known) => (known, Some(rows)),
+    pub(crate) fn new(rows: impl Into<Arc<Transitions>>, file: &Path, hash: String) -> Self {
+        let rows = rows.into();
+        let known = match rows.with_successors() {
+            Cow::Borrowed(_) => None,
+            Cow::Owned(known) => Some(Arc::new(known)),
+        };
+        let (rows, complete) = match known {
+            None => (rows, None),
+            Some(known) => (known, Some(rows)),
         };
         Self { rows, complete, own_actions: None, file: file.to_owned(), hash }
     }
@@ -153,12 +159,12 @@ impl Table {
 
     /// All rows, for whoever learns without looking at s' where an episode ended.
     pub fn complete(&self) -> &Transitions {
-        self.complete.as_ref().unwrap_or(&self.rows)
+        self.complete.as_deref().unwrap_or(&self.rows)
     }
 
     pub(crate) fn scale(&mut self, range: &ActionRange) {
-        range.to_unit(&mut self.rows.actions);
-        self.complete.iter_mut().for_each(|t| range.to_unit(&mut t.actions));
+        range.to_unit(&mut Arc::make_mut(&mut self.rows).actions);
+        self.complete.iter_mut().for_each(|t| range.to_unit(&mut Arc::make_mut(t).actions));
     }
 
     pub(crate) fn behaviour(&self, reference: Option<ReferenceScores>, limit: Option<usize>) -> Behaviour {

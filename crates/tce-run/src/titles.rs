@@ -42,7 +42,7 @@ mod tests {
         for preset in [Preset::Paper, Preset::Default, Preset::Quick] {
             for &variant in Variant::value_variants() {
                 let config = Layered::new(preset, None, Some(variant), None, &[]).unwrap().config().unwrap();
-                let published = variant.name().ends_with("-published");
+                let published = variant.mode() == Mode::Published;
                 assert_eq!(config.learner.mode() == Some(Mode::Published), published);
                 assert_eq!(variant.row_title(&config).ends_with(" (published)"), published);
                 assert!(

@@ -5,10 +5,10 @@
 //! | `policy-seedN.safetensors` | the policies, one per seed |
 //! | `policy.safetensors` | the recommended one |
 //! | `verdict.json` | why it is recommended |
-//! | `floor/` | the clones of the target rows, where the policies learned from more than those |
-//! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | how it went, and what decided it |
+//! | `baseline/` | the clones of the target rows, where the policies learned from more than those |
+//! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | metrics, settings, inputs of the key, results |
 //!
-//! The same run in the same directory is taken from it, or resumed from its checkpoints.
+//! A second call with the same directory returns the finished run, or resumes from its checkpoints.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,16 +22,16 @@ use tce_zoo::actors::Arena;
 
 use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::course::{Course, learning};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, Table};
-use crate::judge::Judge;
 use crate::learning::{Learned, MemberData, learn, save_policies};
 use crate::methods::row_scores;
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
-use crate::processor::Processor;
 use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
-/// The name of the baseline: what stands beside policies that more than the target rows were used for.
+/// The name of the baseline: clones of the target rows alone.
 const BASELINE: &str = "cloning the target rows";
 
 /// Whether the policies are compared, with each other and with a baseline.
@@ -39,16 +39,16 @@ const BASELINE: &str = "cloning the target rows";
 pub enum Comparison {
     /// Learn a baseline from the target rows alone, try all policies in learned dynamics, and recommend one.
     Recommend,
-    /// Learn the policies, and no more.
+    /// Only train the policies.
     Skip,
 }
 
-/// What a training run is told besides its tables.
+/// The inputs of a training run besides its tables.
 #[derive(Clone, Debug)]
 pub struct TrainingRun<'a> {
     /// The settings.
     pub config: &'a Config,
-    /// A policy for each.
+    /// One policy is trained for each seed.
     pub seeds: &'a [u64],
     /// What the user said of the tables.
     pub own: &'a Own,
@@ -58,7 +58,7 @@ pub struct TrainingRun<'a> {
     pub out: &'a Path,
 }
 
-/// What a training run leaves behind: `summary.json`.
+/// The results of a training run: `summary.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
     /// The policies' files, one per seed.
@@ -126,9 +126,9 @@ impl TrainingRun<'_> {
         let verdict = match self.comparison {
             Comparison::Skip => None,
             Comparison::Recommend => {
-                let floor = inputs.extra.is_none();
-                let own = Candidate { name: method.name.into(), floor, files: policies.clone() };
-                let baseline = (!floor).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
+                let alone_is_baseline = inputs.extra.is_none();
+                let own = Candidate { name: method.name.into(), baseline: alone_is_baseline, files: policies.clone() };
+                let baseline = (!alone_is_baseline).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
                 Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
             }
         };
@@ -139,7 +139,7 @@ impl TrainingRun<'_> {
 
     /// What every seed learns from.
     fn members(&self, inputs: &Inputs) -> Result<Vec<MemberData>> {
-        // Who models the dynamics has no use for a terminal row without a successor.
+        // Models of the dynamics cannot use a terminal row without a successor.
         let complete = !self.config.learner.algorithm.about().successors;
         let target = match complete {
             true => inputs.learned_from(&self.config.target),
@@ -165,17 +165,17 @@ impl TrainingRun<'_> {
         Ok(self.seeds.iter().map(member).collect())
     }
 
-    /// What the target rows alone are good for: an ensemble of clones per seed, in `floor/`.
+    /// Trains the baseline: an ensemble of clones of the target rows per seed, in `baseline/`.
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
-        let directory = self.out.join("floor");
+        let directory = self.out.join("baseline");
         tce_base::begin_step(&learning(BASELINE));
         let mut files = Vec::new();
         learn(data, &learner, &self.config.evaluation, None, (&directory, key), device, |policies| {
             files = save_policies(policies, self.seeds, &directory, inputs)?;
             Ok(())
         })?;
-        Ok(Candidate { name: BASELINE.into(), floor: true, files })
+        Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 
     fn baseline_learner(&self) -> LearnerConfig {
@@ -183,14 +183,14 @@ impl TrainingRun<'_> {
     }
 
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
-        let judge = || Judge::train(inputs, &self.config.dynamics, self.out, device);
-        // Without a simulator a single policy is tried, too: nothing else tells what it is worth.
+        let evaluator = || OffPolicyEvaluator::train(inputs, &self.config.dynamics, self.out, device);
+        // Without a simulator a single policy is tried, too: there is no other estimate of its return.
         let alone = self.own.env.and_then(|_| only(&candidates));
         let fitted_q = (self.config.fitted_q.steps > 0).then_some((&self.config.fitted_q, device));
-        keep(alone.map_or_else(|| recommend(judge, &candidates, fitted_q), Ok)?, self.out)
+        keep(alone.map_or_else(|| recommend(evaluator, &candidates, fitted_q), Ok)?, self.out)
     }
 
-    /// What decides the result.
+    /// All inputs that decide the result.
     fn spec(&self, inputs: &Inputs, device: &Device) -> serde_json::Value {
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": self.config, "seeds": self.seeds, "own": self.own,
@@ -199,11 +199,11 @@ impl TrainingRun<'_> {
         if let Some(source) = &inputs.source {
             spec["source"] = source.hash.clone().into();
         }
-        Processor::from(device).sign(&mut spec);
+        DeviceKind::from(device).sign(&mut spec);
         spec
     }
 
-    /// Tells the steps that are to come.
+    /// Plans the steps of the command.
     fn plan(&self, inputs: &Inputs, device: &Device) {
         let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
@@ -220,10 +220,10 @@ impl TrainingRun<'_> {
     }
 }
 
-/// What a training of `spec` left in `out`, if it came to its end; None where it is to begin or to go on.
+/// The finished training of `spec` in `out`; None if it has to be started or resumed.
 ///
 /// # Errors
-/// If another training's results, or what it left when it was interrupted, are there.
+/// If `out` holds results or checkpoints of another training.
 fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
     let (spec_file, summary_file) = (out.join("spec.json"), out.join("summary.json"));
     let summary = read_if_there(&summary_file)?;
@@ -234,9 +234,9 @@ fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
     if !same {
         let end = if summary.is_some() { "the results of" } else { "an interrupted" };
         return Err(Error::Usage(format!(
-            "{}: found {end} learning with other settings, seeds or files; choose another --out{}",
+            "{}: found {end} training run with other settings, seeds or files; choose another --out{}",
             out.display(),
-            if summary.is_some() { " (tce evaluate judges a policy that is there)" } else { ", or remove it" }
+            if summary.is_some() { " (tce evaluate tries a policy that is there)" } else { ", or remove it" }
         )));
     }
     let Some(bytes) = summary else { return Ok(None) };

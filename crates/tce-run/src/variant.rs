@@ -1,14 +1,19 @@
 //! The rows of the paper's tables, each as a layer of configuration and nothing else.
 
 use std::fmt;
+use std::sync::LazyLock;
 
 use clap::ValueEnum;
-use serde::{Deserialize, Serialize};
+use clap::builder::PossibleValue;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tce_data::Shift;
+use tce_learn::{Mode, OtherRows};
+
+use crate::config::Algorithm;
 
 /// A method of the comparison.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Variant {
     /// TCE with generated rows alone (λ = 0).
     TceOg,
@@ -28,41 +33,13 @@ pub enum Variant {
     TceNoFilter,
     /// TCE(OG) without the behaviour-policy term.
     TceNoReg,
-    /// DARA on target and source rows.
-    Dara,
-    /// DARA as its public code has it.
-    DaraPublished,
-    /// BOSA on target and source rows.
-    Bosa,
-    /// BOSA as its public code has it.
-    BosaPublished,
-    /// SRPO on target and source rows.
-    Srpo,
-    /// SRPO as its public code has it.
-    SrpoPublished,
-    /// IGDF on target and source rows.
-    Igdf,
-    /// IGDF as its public code has it.
-    IgdfPublished,
-    /// OTDF on target and source rows.
-    Otdf,
-    /// OTDF as its public code has it.
-    OtdfPublished,
-    /// Meta-DT on target and source rows, zero-shot.
-    MetaDt,
-    /// TD3+BC on target and source rows.
-    Td3Bc,
-    /// ReBRAC on target and source rows.
-    Rebrac,
+    /// A method of the registry on target and source rows, in one of its forms.
+    Prior(Algorithm, Mode),
     /// IQL on target rows and rows of a model of whole target transitions (SynthER).
     Synther,
-    /// DmC, corrected: source rows and guided generated rows, filtered and weighed by their scores.
-    Dmc,
-    /// DmC as its code runs.
-    DmcPublished,
     /// Behaviour cloning of the target rows, observations as they are.
     BcRaw,
-    /// Behaviour cloning of the target rows, observations standardised: the floor.
+    /// Behaviour cloning of the target rows, observations standardised.
     Bc,
     /// Behaviour cloning of the best half of the target trajectories, observations standardised.
     BcTop,
@@ -70,42 +47,109 @@ pub enum Variant {
     BcEnsemble,
 }
 
+/// A variant and its name on the command line and in files.
+struct Named {
+    variant: Variant,
+    name: String,
+}
+
+/// All variants, in the order of the help.
+static ALL: LazyLock<Vec<Variant>> = LazyLock::new(|| NAMED.iter().map(|n| n.variant).collect());
+
+/// All variants with their names: TCE and its ablations, prior methods, baselines.
+static NAMED: LazyLock<Vec<Named>> = LazyLock::new(|| {
+    use Variant::*;
+    let tce = [TceOg, TceNn, TceOt, SimpleAug, TargetOnly, TargetSource, IqlSwt, TceNoFilter, TceNoReg];
+    // BC and IQL are the learners of other variants.
+    let prior = Algorithm::ALL.iter().filter(|a| !matches!(a, Algorithm::Bc | Algorithm::Iql));
+    let forms = prior.flat_map(|&algorithm| {
+        let published = algorithm.about().published.map(|_| Prior(algorithm, Mode::Published));
+        std::iter::once(Prior(algorithm, Mode::Corrected)).chain(published)
+    });
+    let all = tce.into_iter().chain(forms).chain([Synther, BcRaw, Bc, BcTop, BcEnsemble]);
+    all.map(|variant| {
+        let (name, ..) = variant.about();
+        let form = if variant.mode() == Mode::Published { "-published" } else { "" };
+        Named { variant, name: format!("{name}{form}") }
+    })
+    .collect()
+});
+
 impl Variant {
-    /// The floors that stand beside every result.
-    pub const FLOORS: [Variant; 5] =
+    /// The baselines that stand beside every result.
+    pub const BASELINES: [Variant; 5] =
         [Variant::BcRaw, Variant::Bc, Variant::BcTop, Variant::TargetOnly, Variant::BcEnsemble];
 
     /// The name on the command line and in files.
-    pub fn name(self) -> String {
-        self.to_possible_value().expect("no variant is hidden").get_name().to_owned()
+    pub fn name(self) -> &'static str {
+        NAMED.iter().find(|n| n.variant == self).map_or(self.base(), |n| &n.name)
+    }
+
+    /// The name without the form that the method has: `dara` of both `dara` and `dara-published`.
+    pub fn base(self) -> &'static str {
+        self.about().0
+    }
+
+    /// The form of a method whose public code differs from its paper.
+    pub fn mode(self) -> Mode {
+        match self {
+            Variant::Prior(_, mode) => mode,
+            _ => Mode::Corrected,
+        }
     }
 
     /// The name in tables, without the mode, which is the configuration's to tell.
     pub(crate) fn title(self) -> &'static str {
+        self.about().1
+    }
+
+    /// Name without the form, title, and what it is.
+    fn about(self) -> (&'static str, &'static str, &'static str) {
         match self {
-            Variant::TceOg => "TCE(OG)",
-            Variant::TceNn => "TCE(NN)",
-            Variant::TceOt => "TCE(OT)",
-            Variant::SimpleAug => "Simple Aug.",
-            Variant::TargetOnly => "Target Only (IQL)",
-            Variant::TargetSource => "Target+Source (IQL*)",
-            Variant::IqlSwt => "IQL*(SwT)",
-            Variant::TceNoFilter => "TCE(OG) w/o filtering",
-            Variant::TceNoReg => "TCE(OG) w/o policy reg.",
-            Variant::Dara | Variant::DaraPublished => "DARA",
-            Variant::Bosa | Variant::BosaPublished => "BOSA",
-            Variant::Srpo | Variant::SrpoPublished => "SRPO",
-            Variant::Igdf | Variant::IgdfPublished => "IGDF",
-            Variant::Otdf | Variant::OtdfPublished => "OTDF",
-            Variant::MetaDt => "Meta-DT*",
-            Variant::Td3Bc => "TD3+BC",
-            Variant::Rebrac => "ReBRAC",
-            Variant::Synther => "SynthER",
-            Variant::Dmc | Variant::DmcPublished => "DmC",
-            Variant::BcRaw => "BC, raw observations",
-            Variant::Bc => "BC, standardised",
-            Variant::BcTop => "BC, best half",
-            Variant::BcEnsemble => "BC, ensemble of 5",
+            Variant::TceOg => ("tce-og", "TCE(OG)", "TCE with generated rows alone (λ = 0)"),
+            Variant::TceNn => {
+                ("tce-nn", "TCE(NN)", "TCE with the λ share of source rows nearest to the target (Eq. 9)")
+            }
+            Variant::TceOt => {
+                ("tce-ot", "TCE(OT)", "TCE with source rows selected by optimal transport (OTDF's costs)")
+            }
+            Variant::SimpleAug => {
+                ("simple-aug", "Simple Aug.", "Generated from target states alone (Table 3, \"Simple Aug.\")")
+            }
+            Variant::TargetOnly => {
+                ("target-only", "Target Only (IQL)", "IQL on the target rows alone, observations standardised")
+            }
+            Variant::TargetSource => {
+                ("target-source", "Target+Source (IQL*)", "IQL on target and source rows as they are (IQL*)")
+            }
+            Variant::IqlSwt => {
+                ("iql-swt", "IQL*(SwT)", "IQL on target rows and source rows with inferred actions (Table G.2)")
+            }
+            Variant::TceNoFilter => ("tce-no-filter", "TCE(OG) w/o filtering", "TCE(OG) without the z-score filter"),
+            Variant::TceNoReg => ("tce-no-reg", "TCE(OG) w/o policy reg.", "TCE(OG) without the behaviour-policy term"),
+            Variant::Prior(algorithm, _) => {
+                let about = algorithm.about();
+                (about.name, about.title, about.description)
+            }
+            Variant::Synther => {
+                ("synther", "SynthER", "IQL on target rows and rows of a model of whole target transitions (SynthER)")
+            }
+            Variant::BcRaw => {
+                ("bc-raw", "BC, raw observations", "Behaviour cloning of the target rows, observations as they are")
+            }
+            Variant::Bc => {
+                ("bc", "BC, standardised", "Behaviour cloning of the target rows, observations standardised")
+            }
+            Variant::BcTop => (
+                "bc-top",
+                "BC, best half",
+                "Behaviour cloning of the best half of the target trajectories, observations standardised",
+            ),
+            Variant::BcEnsemble => (
+                "bc-ensemble",
+                "BC, ensemble of 5",
+                "The mean of five clones of the target rows, observations standardised",
+            ),
         }
     }
 
@@ -121,18 +165,25 @@ impl Variant {
             let learner = "learner.algorithm = \"iql\"\nlearner.iql.regulariser = \"none\"\n";
             rows(generated, source, lambda) + learner
         };
-        let rival = |algorithm: &str, table: &str, rest: &str| {
+        let prior = |algorithm: Algorithm, mode: Mode| {
+            let about = algorithm.about();
             // As many generated rows as source rows, as where DmC generates a million beside a million; it does so for smaller sources, too.
-            let mixture = if table == "dmc" { rows("dmc", "all", 0.5) } else { rows("none", "all", 1.0) };
-            format!("{mixture}learner.algorithm = {algorithm:?}\nlearner.iql.regulariser = \"none\"\n")
-                + rest
-                + &match self.name().ends_with("-published") {
-                    true => format!("learner.{table}.mode = \"published\"\n"),
-                    false => String::new(),
-                }
+            let mixture = match about.needs {
+                OtherRows::Scored => rows("dmc", "all", 0.5),
+                OtherRows::Any | OtherRows::Source => rows("none", "all", 1.0),
+            };
+            let learner = format!("learner.algorithm = {:?}\nlearner.iql.regulariser = \"none\"\n", about.name);
+            // OTDF's own choice of its β_reg.
+            let beta_reg = match (algorithm, shift) {
+                (Algorithm::Otdf, Some(Shift::Kinematic)) => "learner.otdf.beta_reg = 0.1\n",
+                _ => "",
+            };
+            let mode = match mode {
+                Mode::Published => format!("learner.{}.mode = \"published\"\n", about.table),
+                Mode::Corrected => String::new(),
+            };
+            mixture + &learner + beta_reg + &mode
         };
-        // OTDF's own choice of its β_reg.
-        let beta_reg = if shift == Some(Shift::Kinematic) { "learner.otdf.beta_reg = 0.1\n" } else { "" };
         let bc = |ensemble: usize, rest: &str| {
             let learner = format!("learner.algorithm = \"bc\"\nlearner.bc.ensemble = {ensemble}\n");
             rows("none", "none", 0.0) + &learner + rest
@@ -147,16 +198,8 @@ impl Variant {
             Variant::IqlSwt => iql("none", "relabelled", 1.0),
             Variant::TceNoFilter => rows("tce", "none", 0.0) + "filter.enabled = false\n",
             Variant::TceNoReg => iql("tce", "none", 0.0),
-            Variant::Dara | Variant::DaraPublished => rival("dara", "dara", ""),
-            Variant::Bosa | Variant::BosaPublished => rival("bosa", "bosa", ""),
-            Variant::Srpo | Variant::SrpoPublished => rival("srpo", "srpo", ""),
-            Variant::Igdf | Variant::IgdfPublished => rival("igdf", "igdf", ""),
-            Variant::Otdf | Variant::OtdfPublished => rival("otdf", "otdf", beta_reg),
+            Variant::Prior(algorithm, mode) => prior(algorithm, mode),
             Variant::Synther => iql("synther", "none", 0.0),
-            Variant::Dmc | Variant::DmcPublished => rival("dmc", "dmc", ""),
-            Variant::MetaDt => rival("meta-dt", "meta_dt", ""),
-            Variant::Td3Bc => rival("td3-bc", "td3_bc", ""),
-            Variant::Rebrac => rival("rebrac", "rebrac", ""),
             Variant::BcRaw => bc(1, "learner.standardise = false\n"),
             Variant::Bc => bc(1, "learner.standardise = true\n"),
             Variant::BcTop => bc(1, "learner.standardise = true\nlearner.top = 0.5\n"),
@@ -167,6 +210,54 @@ impl Variant {
 
 impl fmt::Display for Variant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(&self.name())
+        f.pad(self.name())
+    }
+}
+
+impl ValueEnum for Variant {
+    fn value_variants<'a>() -> &'a [Self] {
+        &ALL
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        let what = self.about().2;
+        Some(PossibleValue::new(self.name()).help(match self.mode() {
+            Mode::Published => "The same as its public code has it",
+            Mode::Corrected => what,
+        }))
+    }
+}
+
+impl Serialize for Variant {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Variant {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        static NAMES: LazyLock<Vec<&'static str>> = LazyLock::new(|| NAMED.iter().map(|n| n.name.as_str()).collect());
+        let name = String::deserialize(from)?;
+        let found = NAMED.iter().find(|n| n.name == name);
+        found.map(|n| n.variant).ok_or_else(|| D::Error::unknown_variant(&name, &NAMES))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn forms_of_prior_methods_come_from_the_registry() {
+        let published = Variant::Prior(Algorithm::Dara, Mode::Published);
+        assert_eq!((published.name(), published.base()), ("dara-published", "dara"));
+        assert_eq!(Variant::from_str("dara-published", false).unwrap(), published);
+        assert_eq!(serde_json::from_str::<Variant>("\"dara-published\"").unwrap(), published);
+        assert!(Variant::from_str("rebrac-published", false).is_err(), "it has one form");
+        let toy = Variant::Prior(Algorithm::Toy, Mode::Corrected);
+        assert_eq!(toy.name(), "toy", "a further learner is a variant, too");
+        for variant in Variant::value_variants() {
+            assert_eq!(serde_json::to_value(variant).unwrap(), variant.name());
+        }
     }
 }

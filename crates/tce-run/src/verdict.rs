@@ -1,15 +1,15 @@
-//! Which policy is recommended, told from the two data sets alone ([`crate::judge`]), and how sure that is.
+//! Recommends a policy from the two data sets alone ([`crate::off_policy_evaluation`]), and says how sure that is.
 //!
 //! Every policy is tried from the same target states in the same learned models, so that two policies are compared episode by
 //! episode. The rule, measured in bench/expansion.md:
 //!
-//! 1. The standard is the floor whose imagined return is highest.
+//! 1. The standard is the baseline whose imagined return is highest.
 //! 2. A method is recommended instead if its imagined episodes return more than the standard's, by more than [`SURE`] standard errors of
 //!    the paired differences and by more than [`LEAST`] of the standard's return. Of several, the one with the highest return.
 //! 3. Of several seeds of the recommended method, the one with the highest imagined return is taken.
 //!
-//! Learned dynamics err, and a policy that leaves the data errs with them: where the difference is within what the models cannot
-//! tell, the floor stands.
+//! Learned dynamics have errors, above all away from the data. If the difference is smaller than what they can resolve, the baseline
+//! is recommended.
 
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ use tce_learn::{FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
 
 use crate::error::{Error, Result};
-use crate::judge::{Judge, Judged};
+use crate::off_policy_evaluation::{OffPolicyEstimate, OffPolicyEvaluator};
 
 /// Standard errors of a difference that is more than chance.
 pub const SURE: f64 = 2.0;
@@ -33,19 +33,20 @@ pub const FILE: &str = "policy.safetensors";
 pub struct Candidate {
     /// The method's name in tables.
     pub name: String,
-    /// Whether it is a floor: no more than the target rows, no generated ones.
-    pub floor: bool,
+    /// Whether it is a baseline: it learned from target rows alone.
+    pub baseline: bool,
     /// The policies' files.
     pub files: Vec<PathBuf>,
 }
 
-/// What was found of a candidate.
+/// The estimates of a candidate.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tried {
     /// The method's name.
     pub name: String,
-    /// Whether it is a floor.
-    pub floor: bool,
+    /// Whether it is a baseline.
+    #[serde(alias = "floor")]
+    pub baseline: bool,
     /// Imagined return, mean over the seeds.
     pub imagined_return: f64,
     /// Standard error of it, over the imagined episodes of the policies' mean.
@@ -83,10 +84,10 @@ pub struct Verdict {
 }
 
 /// Mean over the seeds of every imagined episode's return.
-fn episodes(judged: &[Judged]) -> Vec<f64> {
-    let count = judged.len().max(1) as f64;
-    let n = judged.first().map_or(0, |j| j.returns.len());
-    (0..n).map(|i| judged.iter().map(|j| j.returns[i]).sum::<f64>() / count).collect()
+fn episodes(estimates: &[OffPolicyEstimate]) -> Vec<f64> {
+    let count = estimates.len().max(1) as f64;
+    let n = estimates.first().map_or(0, |j| j.returns.len());
+    (0..n).map(|i| estimates.iter().map(|j| j.returns[i]).sum::<f64>() / count).collect()
 }
 
 /// Mean and its standard error.
@@ -116,52 +117,54 @@ pub fn only(candidates: &[Candidate]) -> Option<Verdict> {
 }
 
 /// Tries all candidates in learned dynamics and recommends one. With `fitted_q` their policies are evaluated by fitted Q, too: those
-/// figures are shown and decide nothing, because they do not rank policies (bench/expansion.md).
+/// metrics are shown and decide nothing, because they do not rank policies (bench/expansion.md).
 ///
 /// # Errors
 /// If there is no candidate, a policy cannot be read, or the dynamics cannot be learned.
 pub fn recommend(
-    judge: impl FnOnce() -> Result<Judge>,
+    evaluator: impl FnOnce() -> Result<OffPolicyEvaluator>,
     candidates: &[Candidate],
     fitted_q: Option<(&FittedQConfig, &Device)>,
 ) -> Result<Verdict> {
-    let judge = judge()?;
+    let evaluator = evaluator()?;
     tce_base::begin_step("verdict");
     let progress = Progress::new("try policies", candidates.iter().map(|c| c.files.len() as u64).sum(), "policies");
     let load_all = |c: &Candidate| c.files.iter().map(|file| Ok(Policy::load(file)?)).collect::<Result<Vec<_>>>();
     let policies = candidates.iter().map(load_all).collect::<Result<Vec<_>>>()?;
-    let try_one = |policy: &Policy| judge.judge(policy).inspect(|_| progress.inc(1));
-    let judged = policies.iter().map(|own| own.iter().map(try_one).collect()).collect::<Result<Vec<Vec<_>>>>()?;
+    let try_one = |policy: &Policy| evaluator.evaluate(policy).inspect(|_| progress.inc(1));
+    let estimates = policies.iter().map(|own| own.iter().map(try_one).collect()).collect::<Result<Vec<Vec<_>>>>()?;
     progress.finish();
-    let mut verdict = decide(candidates, &judged)?;
+    let mut verdict = decide(candidates, &estimates)?;
     if let Some((config, device)) = fitted_q {
-        let values = judge.values(&policies.concat(), config, device)?;
+        let values = evaluator.values(&policies.concat(), config, device)?;
         let mut values = values.iter();
         for (tried, candidate) in verdict.tried.iter_mut().zip(candidates) {
             let own: Vec<&FittedValue> = values.by_ref().take(candidate.files.len()).collect();
             let mean = mean_std(&own.iter().map(|v| v.mean()).collect::<Vec<_>>()).0;
             tried.fitted_q = Some([mean, own.iter().map(|v| v.standard_error()).fold(0.0, f64::max)]);
         }
-        verdict.behaviour_value = Some(judge.behaviour_value(config));
+        verdict.behaviour_value = Some(evaluator.behaviour_value(config));
     }
     Ok(verdict)
 }
 
-fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
-    let returns: Vec<Vec<f64>> = judged.iter().map(|j| episodes(j)).collect();
+fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Result<Verdict> {
+    let returns: Vec<Vec<f64>> = estimates.iter().map(|j| episodes(j)).collect();
     let mean = |k: usize| mean_std(&returns[k]).0;
     let best = |of: &dyn Fn(usize) -> bool| {
-        (0..candidates.len()).filter(|&k| of(k) && !judged[k].is_empty()).max_by(|&a, &b| mean(a).total_cmp(&mean(b)))
+        (0..candidates.len())
+            .filter(|&k| of(k) && !estimates[k].is_empty())
+            .max_by(|&a, &b| mean(a).total_cmp(&mean(b)))
     };
-    let standard = best(&|k| candidates[k].floor).or_else(|| best(&|_| true));
+    let standard = best(&|k| candidates[k].baseline).or_else(|| best(&|_| true));
     let standard = standard.ok_or_else(|| Error::Failed("there is no policy to recommend".into()))?;
     let over: Vec<[f64; 2]> = returns.iter().map(|r| difference(r, &returns[standard])).collect();
     let beats = |k: usize| over[k][0] > SURE * over[k][1] && over[k][0] > LEAST * mean(standard).abs();
-    let chosen = best(&|k| !candidates[k].floor && beats(k)).unwrap_or(standard);
-    let rival = best(&|k| k != chosen);
-    let gap = rival.map(|k| difference(&returns[chosen], &returns[k]));
+    let chosen = best(&|k| !candidates[k].baseline && beats(k)).unwrap_or(standard);
+    let next_best = best(&|k| k != chosen);
+    let gap = next_best.map(|k| difference(&returns[chosen], &returns[k]));
     let name = |k: usize| &candidates[k].name;
-    let reason = match (rival, gap) {
+    let reason = match (next_best, gap) {
         (Some(k), Some([by, error])) if chosen != standard => {
             format!(
                 "{} is recommended: tried in learned dynamics it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
@@ -169,7 +172,7 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
                 mean(chosen),
                 name(standard),
                 mean(standard),
-            ) + if k == standard { "" } else { " The next best is no floor." }
+            ) + if k == standard { "" } else { " The next best is not a baseline." }
         }
         (Some(k), Some([by, error])) => format!(
             "{} is recommended: tried in learned dynamics no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
@@ -179,13 +182,14 @@ fn decide(candidates: &[Candidate], judged: &[Vec<Judged>]) -> Result<Verdict> {
         ),
         _ => format!("{} is the only method there is.", name(chosen)),
     };
-    let seed = (0..judged[chosen].len())
-        .max_by(|&a, &b| judged[chosen][a].imagined_return.total_cmp(&judged[chosen][b].imagined_return));
-    let of_seeds =
-        |k: usize, figure: &dyn Fn(&Judged) -> f64| mean_std(&judged[k].iter().map(figure).collect::<Vec<_>>()).0;
+    let seed = (0..estimates[chosen].len())
+        .max_by(|&a, &b| estimates[chosen][a].imagined_return.total_cmp(&estimates[chosen][b].imagined_return));
+    let of_seeds = |k: usize, metric: &dyn Fn(&OffPolicyEstimate) -> f64| {
+        mean_std(&estimates[k].iter().map(metric).collect::<Vec<_>>()).0
+    };
     let tried = |k: usize| Tried {
         name: candidates[k].name.clone(),
-        floor: candidates[k].floor,
+        baseline: candidates[k].baseline,
         imagined_return: mean(k),
         standard_error: mean_and_error(&returns[k])[1],
         survival: of_seeds(k, &|j| j.survival),
@@ -238,9 +242,9 @@ pub fn keep(verdict: Verdict, directory: &Path) -> Result<Kept> {
 mod tests {
     use super::*;
 
-    fn judged(returns: &[f64]) -> Judged {
+    fn estimate(returns: &[f64]) -> OffPolicyEstimate {
         let (mean, std) = mean_std(returns);
-        Judged {
+        OffPolicyEstimate {
             imagined_return: mean,
             standard_error: std,
             supported_return: mean,
@@ -252,39 +256,39 @@ mod tests {
     }
 
     fn candidates(names: &[(&str, bool)]) -> Vec<Candidate> {
-        let of = |(name, floor): &(&str, bool)| Candidate {
+        let of = |(name, baseline): &(&str, bool)| Candidate {
             name: (*name).into(),
-            floor: *floor,
+            baseline: *baseline,
             files: vec![format!("{name}-0").into(), format!("{name}-1").into()],
         };
         names.iter().map(of).collect()
     }
 
     fn choose(method: [&[f64]; 2]) -> Verdict {
-        let floor = vec![judged(&[100.0, 200.0, 300.0, 400.0]), judged(&[100.0, 200.0, 300.0, 402.0])];
-        let method = method.map(judged).to_vec();
-        decide(&candidates(&[("floor", true), ("method", false)]), &[floor, method]).unwrap()
+        let baseline = vec![estimate(&[100.0, 200.0, 300.0, 400.0]), estimate(&[100.0, 200.0, 300.0, 402.0])];
+        let method = method.map(estimate).to_vec();
+        decide(&candidates(&[("baseline", true), ("method", false)]), &[baseline, method]).unwrap()
     }
 
     #[test]
-    fn a_method_has_to_beat_the_floor_episode_by_episode() {
+    fn a_method_has_to_beat_the_baseline_episode_by_episode() {
         // Fifty more in every episode: certain, however much the episodes differ.
         let ahead = choose([&[150.0, 250.0, 350.0, 450.0], &[150.0, 250.0, 350.0, 452.0]]);
         assert_eq!((ahead.method.as_str(), ahead.policy.to_str(), ahead.sure), ("method", Some("method-1"), true));
         assert_eq!(ahead.tried[1].over_standard[0], 50.0);
         // As much on average, from one episode: chance.
         let lucky = choose([&[100.0, 200.0, 300.0, 600.0], &[100.0, 200.0, 300.0, 600.0]]);
-        assert_eq!((lucky.method.as_str(), lucky.sure), ("floor", false));
+        assert_eq!((lucky.method.as_str(), lucky.sure), ("baseline", false));
         // Always more, but by nothing that matters.
         let slightly = choose([&[101.0, 201.0, 301.0, 402.0], &[101.0, 201.0, 301.0, 402.0]]);
-        assert_eq!(slightly.method, "floor");
-        assert_eq!(slightly.policy.to_str(), Some("floor-1"), "the better seed");
+        assert_eq!(slightly.method, "baseline");
+        assert_eq!(slightly.policy.to_str(), Some("baseline-1"), "the better seed");
     }
 
     #[test]
-    fn without_floors_the_best_is_taken_and_without_policies_nothing() {
+    fn without_baselines_the_best_is_taken_and_without_policies_nothing() {
         let two = candidates(&[("a", false), ("b", false)]);
-        let verdict = decide(&two, &[vec![judged(&[1.0, 2.0])], vec![judged(&[3.0, 4.0])]]).unwrap();
+        let verdict = decide(&two, &[vec![estimate(&[1.0, 2.0])], vec![estimate(&[3.0, 4.0])]]).unwrap();
         assert_eq!(verdict.method, "b");
         assert!(decide(&two, &[vec![], vec![]]).is_err());
     }

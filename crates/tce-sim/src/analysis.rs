@@ -1,7 +1,7 @@
 //! One-step predictions for states and actions that need not come from a rollout.
 
 use rayon::prelude::*;
-use tce_base::interrupted;
+use tce_base::{Interrupted, interrupted};
 use tce_data::{Agent, Shift};
 
 use crate::SimError;
@@ -64,7 +64,7 @@ pub fn simulate(agent: Agent, shift: Shift, states: &[f32], actions: &[f32]) -> 
             || Env::with_model(agent, model.clone()),
             |env, (((next, rewards), terminals), (states, actions))| {
                 if interrupted() {
-                    return Err(SimError::Interrupted);
+                    return Err(SimError::from(Interrupted::nothing_kept()));
                 }
                 let inputs = states.chunks_exact(obs_dim).zip(actions.chunks_exact(act_dim));
                 let outputs = next.chunks_exact_mut(obs_dim).zip(rewards).zip(terminals);

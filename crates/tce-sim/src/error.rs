@@ -119,6 +119,6 @@ pub enum SimError {
         rows: usize,
     },
     /// The user asked to stop.
-    #[error("interrupted")]
-    Interrupted,
+    #[error(transparent)]
+    Interrupted(#[from] tce_base::Interrupted),
 }

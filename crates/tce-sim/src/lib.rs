@@ -6,7 +6,7 @@
 //! | One environment? | [`Env`] |
 //! | A data set? | [`collect`] |
 //! | A policy's returns? | [`evaluate`] |
-//! | What it looks like? | [`evaluate_recorded`], then a [`film::Film`] of the recordings |
+//! | What it looks like? | [`evaluate_recorded`], then a [`video::Video`] of the recordings |
 //! | Do stored transitions follow the dynamics? | [`replay`] (whole data sets), [`simulate`] (single rows) |
 //! | Is there a MuJoCo? | [`open_library`], before a command begins; everything else opens it by itself |
 //! | Would a generated state end the episode? | [`terminal_rule`] |
@@ -15,12 +15,12 @@ mod actor;
 mod analysis;
 mod env;
 mod error;
-pub mod film;
 mod library;
 pub mod models;
 mod recording;
 mod replay;
 mod rollout;
+pub mod video;
 
 pub use actor::{Actor, UniformActor};
 pub use analysis::{Simulated, simulate};

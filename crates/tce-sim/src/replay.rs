@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::{Progress, interrupted};
+use tce_base::{Interrupted, Progress, interrupted};
 use tce_data::{Agent, Episode, Shift, Transitions};
 
 use crate::SimError;
@@ -170,7 +170,7 @@ fn replay_episode(env: &mut Env, data: &Transitions, episode: Episode) -> Result
     let mut outcomes = Vec::with_capacity(episode.end - episode.start);
     for row in episode.start..episode.end {
         if interrupted() {
-            return Err(SimError::Interrupted);
+            return Err(SimError::from(Interrupted::nothing_kept()));
         }
         let observation = data.observation(row);
         if row > episode.start && data.next_observation(row - 1) != observation {

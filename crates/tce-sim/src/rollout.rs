@@ -4,7 +4,7 @@ use mujoco_rs::prelude::MjModel;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
-use tce_base::{Progress, Rng, Streams, interrupted};
+use tce_base::{Interrupted, Progress, Rng, Streams, interrupted};
 use tce_data::{Agent, Shift, Transitions};
 
 use crate::actor::Actor;
@@ -249,7 +249,7 @@ pub fn collect<A: Actor>(
     let mut finished = Vec::with_capacity(lanes);
     while !lockstep.lanes.is_empty() {
         if interrupted() {
-            return Err(SimError::Interrupted);
+            return Err(Interrupted::nothing_kept().into());
         }
         let rows = lockstep.lanes.len() as u64;
         lockstep.tick(&mut finished)?;
@@ -368,7 +368,7 @@ fn evaluate_lanes<A: Actor>(
     let mut finished = Vec::with_capacity(episodes);
     while !lockstep.lanes.is_empty() {
         if stop() {
-            return Err(SimError::Interrupted);
+            return Err(Interrupted::nothing_kept().into());
         }
         lockstep.tick(&mut finished)?;
     }

@@ -1,13 +1,13 @@
-//! Why a film cannot be written.
+//! Why a video cannot be written.
 
 use std::path::{Path, PathBuf};
 
-/// Any reason for which there is no film.
+/// Any reason for which there is no video.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The user interrupted it.
+    /// The user asked to stop.
     #[error(transparent)]
-    Sim(#[from] tce_sim::SimError),
+    Interrupted(#[from] tce_base::Interrupted),
     /// A file could not be written.
     #[error(transparent)]
     File(#[from] tce_base::FileError),
@@ -17,7 +17,7 @@ pub enum Error {
     /// The encoder is missing.
     #[error("{}: {what}", path.display())]
     Missing {
-        /// The film's file.
+        /// The video's file.
         path: PathBuf,
         /// What is missing, and what to do.
         what: String,
@@ -25,11 +25,11 @@ pub enum Error {
 }
 
 impl Error {
-    /// There is no film at `path`, for want of something.
+    /// There is no video at `path`, for want of something.
     pub fn missing(path: &Path, what: impl Into<String>) -> Self {
         Self::Missing { path: path.to_owned(), what: what.into() }
     }
 }
 
-/// The result of writing a film.
+/// The result of writing a video.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

@@ -1,4 +1,4 @@
-//! GIF: one palette for the whole film, and of every picture only what changed.
+//! GIF: one palette for the whole video, and of every picture only what changed.
 
 use std::collections::HashMap;
 use std::io::{self, BufWriter, Write};
@@ -7,7 +7,7 @@ use std::path::Path;
 use gif::{DisposalMethod, Encoder, EncodingError, Frame, Repeat};
 use rayon::prelude::*;
 use tce_base::{AtomicFile, FileError, Progress};
-use tce_sim::film::{Colour, Film, Picture};
+use tce_sim::video::{Colour, Picture, Video};
 
 use crate::error::Result;
 
@@ -16,8 +16,8 @@ const LOOKED_AT: usize = 24;
 /// The colour that leaves a pixel as it is. The others are those before it.
 const KEEP: u8 = 255;
 
-/// Writes `film` as an endless loop; `path` is the name that errors tell.
-pub fn write(film: &Film, file: &mut AtomicFile, path: &Path, progress: &Progress) -> Result<()> {
+/// Writes `video` as an endless loop; `path` is the name that errors tell.
+pub fn write(video: &Video, file: &mut AtomicFile, path: &Path, progress: &Progress) -> Result<()> {
     let failed = |e: EncodingError| {
         let e = match e {
             EncodingError::Io(e) => e,
@@ -25,23 +25,23 @@ pub fn write(film: &Film, file: &mut AtomicFile, path: &Path, progress: &Progres
         };
         FileError::new(path, "write", e)
     };
-    let last = film.frames() - 1;
+    let last = video.frames() - 1;
     let looked_at: Vec<usize> = (0..LOOKED_AT).map(|k| k * last / (LOOKED_AT - 1)).collect();
-    let palette = Palette::of(&looked_at.par_iter().map(|&frame| film.draw(frame)).collect::<Vec<_>>());
-    let [width, height] = film.size();
+    let palette = Palette::of(&looked_at.par_iter().map(|&frame| video.draw(frame)).collect::<Vec<_>>());
+    let [width, height] = video.size();
     let mut encoder =
         Encoder::new(BufWriter::new(file.file()), width as u16, height as u16, &palette.bytes()).map_err(failed)?;
     encoder.set_repeat(Repeat::Infinite).map_err(failed)?;
     let mut before: Vec<u8> = Vec::new();
     let mut number = 0;
-    super::draw(film, progress, |pictures| {
+    super::draw(video, progress, |pictures| {
         let indexed: Vec<Vec<u8>> = pictures.par_iter().map(|picture| palette.indices(picture)).collect();
         let frames: Vec<Frame<'static>> = (0..indexed.len())
             .into_par_iter()
             .map(|k| {
                 let before = if k == 0 { &before } else { &indexed[k - 1] };
                 let mut frame = changes(before, &indexed[k], width);
-                frame.delay = delay(film.interval(), number + k);
+                frame.delay = delay(video.interval(), number + k);
                 frame.make_lzw_pre_encoded();
                 frame
             })
@@ -58,7 +58,7 @@ pub fn write(film: &Film, file: &mut AtomicFile, path: &Path, progress: &Progres
     Ok(())
 }
 
-/// Hundredths of a second for which picture `number` stays. Rounded so that the film as a whole keeps time.
+/// Hundredths of a second for which picture `number` stays. Rounded so that the video as a whole keeps time.
 fn delay(interval: f64, number: usize) -> u16 {
     let until = |n: usize| (100.0 * interval * n as f64).round();
     (until(number + 1) - until(number)) as u16
@@ -94,7 +94,7 @@ struct Palette {
 }
 
 impl Palette {
-    /// The most frequent colours of some pictures. A film of flat areas has few that matter: the rest are mixtures at edges, which
+    /// The most frequent colours of some pictures. A video of flat areas has few that matter: the rest are mixtures at edges, which
     /// a neighbour replaces unseen.
     fn of(pictures: &[Picture]) -> Self {
         let mut counts: HashMap<Colour, u64> = HashMap::new();

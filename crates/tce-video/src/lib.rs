@@ -1,4 +1,4 @@
-//! Films as files: pictures from `tce-sim` are drawn on all cores and encoded in order.
+//! Videos as files: pictures from `tce-sim` are drawn on all cores and encoded in order.
 
 mod error;
 mod gif;
@@ -7,13 +7,12 @@ mod mp4;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
-use tce_base::{AtomicFile, FileError, Progress, interrupted};
-use tce_sim::SimError;
-use tce_sim::film::{Film, Picture};
+use tce_base::{AtomicFile, FileError, Interrupted, Progress, interrupted};
+use tce_sim::video::{Picture, Video};
 
 pub use error::{Error, Result};
 
-/// Pictures that are drawn at once. The film does not depend on it.
+/// Pictures that are drawn at once. The video does not depend on it.
 const BATCH: usize = 16;
 
 /// The kinds of file.
@@ -23,14 +22,14 @@ enum Format {
     Mp4,
 }
 
-/// A film's file, named on the command line: the ending decides what is written.
+/// A video's file, named on the command line: the ending decides what is written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VideoFile {
     path: PathBuf,
     format: Format,
 }
 
-/// Reads `film.gif` and `film.mp4`, and refuses everything else.
+/// Reads `video.gif` and `video.mp4`, and refuses everything else.
 pub fn parse_video(text: &str) -> Result<VideoFile, String> {
     let path = PathBuf::from(text);
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
@@ -52,8 +51,8 @@ pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
     if fits && width % 2 == 0 && height % 2 == 0 { Ok([width, height]) } else { Err(expected.to_owned()) }
 }
 
-/// A film's file that can be written, as far as one can know before the film is there.
-pub struct Studio {
+/// A video's file that can be written, as far as one can know before the video is there.
+pub struct VideoWriter {
     file: AtomicFile,
     path: PathBuf,
     encoder: Encoder,
@@ -71,23 +70,23 @@ impl VideoFile {
     }
 
     /// Makes sure of everything that the file needs, so that what is missing is said before any work.
-    pub fn prepare(self) -> Result<Studio> {
+    pub fn prepare(self) -> Result<VideoWriter> {
         let encoder = match self.format {
             Format::Gif => Encoder::Gif,
             Format::Mp4 => Encoder::Mp4(mp4::Ffmpeg::find(&self.path)?),
         };
-        Ok(Studio { file: AtomicFile::create(&self.path)?, path: self.path, encoder })
+        Ok(VideoWriter { file: AtomicFile::create(&self.path)?, path: self.path, encoder })
     }
 }
 
-impl Studio {
-    /// Draws and writes the film; how many bytes it has.
-    pub fn write(mut self, film: &Film) -> Result<u64> {
+impl VideoWriter {
+    /// Draws and writes the video; how many bytes it has.
+    pub fn write(mut self, video: &Video) -> Result<u64> {
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-        let progress = Progress::new(format!("draw {name}"), film.frames() as u64, "pictures");
+        let progress = Progress::new(format!("draw {name}"), video.frames() as u64, "pictures");
         match &self.encoder {
-            Encoder::Gif => gif::write(film, &mut self.file, &self.path, &progress)?,
-            Encoder::Mp4(ffmpeg) => ffmpeg.write(film, self.file.path(), &self.path, &progress)?,
+            Encoder::Gif => gif::write(video, &mut self.file, &self.path, &progress)?,
+            Encoder::Mp4(ffmpeg) => ffmpeg.write(video, self.file.path(), &self.path, &progress)?,
         }
         self.file.commit()?;
         progress.finish();
@@ -96,15 +95,15 @@ impl Studio {
     }
 }
 
-/// Draws a film batch by batch and hands the pictures over, in order.
-fn draw(film: &Film, progress: &Progress, mut take: impl FnMut(Vec<Picture>) -> Result<()>) -> Result<()> {
-    for start in (0..film.frames()).step_by(BATCH) {
+/// Draws a video batch by batch and hands the pictures over, in order.
+fn draw(video: &Video, progress: &Progress, mut take: impl FnMut(Vec<Picture>) -> Result<()>) -> Result<()> {
+    for start in (0..video.frames()).step_by(BATCH) {
         if interrupted() {
-            return Err(SimError::Interrupted.into());
+            return Err(Interrupted::nothing_kept().into());
         }
-        let frames = start..(start + BATCH).min(film.frames());
+        let frames = start..(start + BATCH).min(video.frames());
         let count = frames.len() as u64;
-        take(frames.into_par_iter().map(|frame| film.draw(frame)).collect())?;
+        take(frames.into_par_iter().map(|frame| video.draw(frame)).collect())?;
         progress.inc(count);
     }
     Ok(())
@@ -119,7 +118,7 @@ mod tests {
         for (text, format) in [("a.gif", Format::Gif), ("b/c.MP4", Format::Mp4)] {
             assert_eq!(parse_video(text).unwrap(), VideoFile { path: text.into(), format });
         }
-        assert!(parse_video("film.webm").unwrap_err().contains("`.webm`"));
+        assert!(parse_video("video.webm").unwrap_err().contains("`.webm`"));
         assert!(parse_video("gif").unwrap_err().contains("no ending"));
     }
 

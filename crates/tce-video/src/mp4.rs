@@ -4,9 +4,8 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use tce_base::{FileError, Progress, interrupted};
-use tce_sim::SimError;
-use tce_sim::film::Film;
+use tce_base::{FileError, Interrupted, Progress, interrupted};
+use tce_sim::video::Video;
 
 use crate::error::{Error, Result};
 
@@ -16,36 +15,36 @@ const WHAT_TO_DO: &str = "install it (`apt install ffmpeg`), or name a file that
 pub struct Ffmpeg(());
 
 impl Ffmpeg {
-    /// Looks for it in PATH; `film` is the file that it is wanted for.
-    pub fn find(film: &Path) -> Result<Self> {
+    /// Looks for it in PATH; `video` is the file that it is wanted for.
+    pub fn find(video: &Path) -> Result<Self> {
         let encoders = Command::new("ffmpeg").args(["-hide_banner", "-encoders"]).stdin(Stdio::null()).output();
         let encoders = match encoders {
             Ok(output) => output.stdout,
             Err(e) if e.kind() == io::ErrorKind::NotFound => {
                 let what = format!("an .mp4 needs the program `ffmpeg`, which is not in PATH; {WHAT_TO_DO}");
-                return Err(Error::missing(film, what));
+                return Err(Error::missing(video, what));
             }
             Err(e) => {
                 let what = format!("an .mp4 needs the program `ffmpeg`, which cannot be run: {e}; {WHAT_TO_DO}");
-                return Err(Error::missing(film, what));
+                return Err(Error::missing(video, what));
             }
         };
         if !String::from_utf8_lossy(&encoders).contains("libx264") {
             let what = "an .mp4 needs an `ffmpeg` with the encoder libx264, which the one in PATH lacks";
-            return Err(Error::missing(film, format!("{what}; {WHAT_TO_DO}")));
+            return Err(Error::missing(video, format!("{what}; {WHAT_TO_DO}")));
         }
         Ok(Self(()))
     }
 
-    /// Lets it encode `film` into the file `at`; `path` is the name that errors tell.
-    pub fn write(&self, film: &Film, at: &Path, path: &Path, progress: &Progress) -> Result<()> {
-        let [width, height] = film.size();
-        let microseconds = (film.interval() * 1e6).round();
+    /// Lets it encode `video` into the file `at`; `path` is the name that errors tell.
+    pub fn write(&self, video: &Video, at: &Path, path: &Path, progress: &Progress) -> Result<()> {
+        let [width, height] = video.size();
+        let microseconds = (video.interval() * 1e6).round();
         let mut command = Command::new("ffmpeg");
         command.args(["-hide_banner", "-loglevel", "error", "-nostdin", "-y"]);
         command.args(["-f", "rawvideo", "-pix_fmt", "rgb24", "-video_size", &format!("{width}x{height}")]);
         command.args(["-framerate", &format!("1000000/{microseconds}"), "-i", "pipe:0"]);
-        // One thread, no dates and no versions: the same film has the same bytes, by the same ffmpeg.
+        // One thread, no dates and no versions: the same video has the same bytes, by the same ffmpeg.
         command.args(["-c:v", "libx264", "-preset", "medium", "-crf", "20", "-pix_fmt", "yuv420p", "-threads", "1"]);
         command.args(["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]);
         command.args(["-movflags", "+faststart", "-f", "mp4"]).arg(at);
@@ -60,7 +59,7 @@ impl Ffmpeg {
             text
         });
         let mut broken = None;
-        let drawn = super::draw(film, progress, |pictures| {
+        let drawn = super::draw(video, progress, |pictures| {
             for picture in pictures {
                 if let Err(e) = pipe.write_all(picture.pixels.as_flattened()) {
                     broken = Some(e);
@@ -79,7 +78,7 @@ impl Ffmpeg {
         let complaints = reader.join().unwrap_or_default();
         if interrupted() && !status.success() {
             // Ctrl-C reaches ffmpeg as well, which may have gone first.
-            return Err(SimError::Interrupted.into());
+            return Err(Interrupted::nothing_kept().into());
         }
         if !status.success() {
             let why = complaints.trim();

@@ -14,16 +14,32 @@ use crate::error::{Error, Result};
 use crate::exhibits::Exhibit;
 use crate::recipes::Recipe;
 
+/// Which of a stochastic policy's actions are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Actions {
+    /// The mean one.
+    Mean,
+    /// Sampled ones.
+    Sampled,
+}
+
+impl Actions {
+    /// Mean or sampled ones.
+    pub fn mean_if(mean: bool) -> Self {
+        if mean { Self::Mean } else { Self::Sampled }
+    }
+}
+
 /// A policy as the simulator wants it.
 pub struct PolicyActor {
     policy: Policy,
-    mean: bool,
+    chosen: Actions,
 }
 
 impl PolicyActor {
     /// Acts by the mean action, or by sampled ones.
-    pub fn new(policy: Policy, mean: bool) -> Self {
-        Self { policy, mean }
+    pub fn new(policy: Policy, chosen: Actions) -> Self {
+        Self { policy, chosen }
     }
 }
 
@@ -35,7 +51,7 @@ impl Actor for PolicyActor {
     }
 
     fn act(&self, observations: &[f32], memories: &mut [Memory], rngs: &mut [Rng], actions: &mut [f32]) {
-        self.policy.act_with(observations, memories, (!self.mean).then_some(rngs), actions);
+        self.policy.act_with(observations, memories, (self.chosen == Actions::Sampled).then_some(rngs), actions);
     }
 
     fn reward(&self, memory: &mut Memory, reward: f64) {
@@ -83,7 +99,7 @@ impl Recipe {
             let to = (self.rows as f64 * before / total).round() as usize;
             let streams = Streams::new(self.seed.wrapping_add(k as u64 * 0x9e37_79b9_7f4a_7c15));
             let options = CollectOptions { rows: to - from, lanes: self.lanes, streams, progress: Some(&progress) };
-            let actor = PolicyActor::new(policy, self.mean);
+            let actor = PolicyActor::new(policy, Actions::mean_if(self.mean));
             out.extend(&tce_sim::collect(self.agent, self.shift, &actor, &options)?);
         }
         progress.finish();
@@ -156,7 +172,7 @@ impl Evaluation {
     }
 }
 
-/// Where policies are judged.
+/// Where policies are evaluated.
 #[derive(Clone, Copy, Debug)]
 pub struct Arena {
     /// The robot.
@@ -174,17 +190,17 @@ impl Arena {
     }
 }
 
-/// Rolls `policy` out for `episodes` episodes, by its `mean` action or by sampled ones, unless `stop` says so:
+/// Rolls `policy` out for `episodes` episodes, by mean or sampled `actions`, unless `stop` says so:
 /// [`tce_base::interrupted`] where the user may end it.
 pub fn evaluate(
     policy: &Policy,
     arena: Arena,
     episodes: usize,
     streams: Streams,
-    mean: bool,
+    actions: Actions,
     stop: impl Fn() -> bool,
 ) -> Result<Evaluation> {
-    let actor = PolicyActor::new(policy.clone(), mean);
+    let actor = PolicyActor::new(policy.clone(), actions);
     let results = tce_sim::evaluate(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
     Ok(Evaluation::of(&results, arena.reference))
 }
@@ -195,10 +211,10 @@ pub fn evaluate_recorded(
     arena: Arena,
     episodes: usize,
     streams: Streams,
-    mean: bool,
+    actions: Actions,
     stop: impl Fn() -> bool,
 ) -> Result<(Evaluation, Recording)> {
-    let actor = PolicyActor::new(policy.clone(), mean);
+    let actor = PolicyActor::new(policy.clone(), actions);
     let (results, recording) = tce_sim::evaluate_recorded(arena.agent, arena.shift, &actor, episodes, streams, stop)?;
     Ok((Evaluation::of(&results, arena.reference), recording))
 }

@@ -44,7 +44,7 @@ pub struct Card {
     /// The rows whose behaviour it was cloned from; none for SAC.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cloned_from: Option<String>,
-    /// Episodes with sampled actions behind the next figures.
+    /// Episodes with sampled actions behind the next metrics.
     pub episodes: usize,
     /// Mean return.
     pub mean: f64,
@@ -59,7 +59,7 @@ pub struct Card {
 }
 
 impl Card {
-    /// The card of a clone of the rows that `cloned_from` describes, before anyone has judged it.
+    /// The card of a clone of the rows that `cloned_from` describes, before anyone has evaluated it.
     pub fn of_clone(agent: Agent, shift: Shift, cloned_from: String, seed: u64, updates: u64, batch: usize) -> Self {
         Self {
             agent,

@@ -1,4 +1,4 @@
-//! How data sets are collected, and by whom.
+//! Recipes of data sets: which actors collect how many rows.
 
 use std::path::PathBuf;
 
@@ -33,7 +33,7 @@ pub struct Recipe {
     pub seed: u64,
 }
 
-/// Who acts in the data sets of one robot in one domain; a part for which nobody is there is empty.
+/// The actors of one robot in one domain; a part without actors is empty.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Cast {
     /// D4RL's medium behaviour.

@@ -30,7 +30,7 @@ use tce_learn::{Buffer, Learner, Meter, Policy, PolicyKind, PolicyLearner};
 use tce_nn::{Device, NamedParameters};
 use tce_sim::{EPISODE_LIMIT, Env};
 
-use crate::actors::{Arena, Evaluation, evaluate, load_policy};
+use crate::actors::{Actions, Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::exhibits::{Card, Exhibit};
 
@@ -82,7 +82,7 @@ pub struct Goal {
 
 /// The mean return of an evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judged {
+pub struct EvaluationSummary {
     /// Environment steps before it.
     pub step: u64,
     /// Mean return.
@@ -101,7 +101,8 @@ pub struct Snapshot {
     /// The score that it was kept for.
     pub at: f64,
     /// How it did then.
-    pub judged: Judged,
+    #[serde(alias = "judged")]
+    pub evaluation: EvaluationSummary,
     /// Its file in the directory.
     pub file: String,
 }
@@ -114,12 +115,12 @@ pub struct Ledger {
     /// Episodes finished.
     pub episode: u64,
     /// All evaluations.
-    pub evaluations: Vec<Judged>,
+    pub evaluations: Vec<EvaluationSummary>,
     /// All snapshots.
     pub snapshots: Vec<Snapshot>,
     /// The checkpoint's files and their SHA-256.
     pub files: Vec<(String, String)>,
-    /// Figures since the last evaluation.
+    /// Metrics since the last evaluation.
     #[serde(default)]
     pub meter: Meter,
 }
@@ -457,13 +458,13 @@ impl Training {
         if trained > 0 && trained.is_multiple_of(self.settings.steps_per_update) {
             let update = trained / self.settings.steps_per_update - 1;
             let batch = self.buffer.sample(update, &self.sac.device());
-            // Figures cost time, and their means need no more than every tenth.
+            // Metrics cost time, and their means need no more than every tenth.
             let mut meter = if update.is_multiple_of(10) { Meter::always() } else { Meter::default() };
             self.sac.update(&batch, update, &mut meter);
             self.ledger.meter.join(meter);
         }
         if self.ledger.step.is_multiple_of(self.settings.evaluate_every) {
-            self.judge()?;
+            self.evaluate()?;
         }
         if result.terminal || timeout {
             self.ledger.episode += 1;
@@ -491,32 +492,32 @@ impl Training {
     }
 
     /// An evaluation with sampled actions, as D4RL's returns are, and the snapshots it is good for.
-    fn judge(&mut self) -> Result<()> {
+    fn evaluate(&mut self) -> Result<()> {
         let Settings { agent, shift, seed, episodes, .. } = self.settings;
         let policy = self.sac.policies().remove(0);
         let arena = Arena::new(agent, shift, ScoreTable::default());
         let streams = Streams::new(seed ^ self.ledger.step);
         // To its end even when the user interrupts: the checkpoint that follows needs it.
-        let evaluation = evaluate(&policy, arena, episodes, streams, false, || false)?;
-        let judged = judged(&evaluation, self.ledger.step);
-        let figures: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
-        let figures = figures.iter().map(|(name, value)| (name.as_str(), *value));
-        self.metrics.log("sac", self.ledger.step, 0, figures)?;
-        let figures = [("return", Some(judged.mean)), ("length", Some(judged.length)), ("score", judged.score)];
-        let figures = figures.into_iter().filter_map(|(name, value)| Some((name, value?)));
-        self.metrics.log("evaluate", self.ledger.step, 0, figures)?;
-        let score = judged.score.map_or(String::new(), |s| format!(", score {s:.1}"));
-        self.progress.message(format!("return {:.0}{score}", judged.mean));
-        // Here and not with the checkpoint: some updates later it is another policy than the one judged.
-        save_card(&policy, &self.directory.join("policy.safetensors"), &self.settings, &judged)?;
+        let evaluation = evaluate(&policy, arena, episodes, streams, Actions::Sampled, || false)?;
+        let summary = summarise(&evaluation, self.ledger.step);
+        let metrics: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
+        let metrics = metrics.iter().map(|(name, value)| (name.as_str(), *value));
+        self.metrics.log("sac", self.ledger.step, 0, metrics)?;
+        let metrics = [("return", Some(summary.mean)), ("length", Some(summary.length)), ("score", summary.score)];
+        let metrics = metrics.into_iter().filter_map(|(name, value)| Some((name, value?)));
+        self.metrics.log("evaluate", self.ledger.step, 0, metrics)?;
+        let score = summary.score.map_or(String::new(), |s| format!(", score {s:.1}"));
+        self.progress.message(format!("return {:.0}{score}", summary.mean));
+        // Here and not with the checkpoint: some updates later it is another policy than the one evaluated.
+        save_card(&policy, &self.directory.join("policy.safetensors"), &self.settings, &summary)?;
         for &at in &self.goal.snapshots {
-            if judged.score.is_some_and(|s| s >= at) && self.ledger.snapshots.iter().all(|s| s.at != at) {
+            if summary.score.is_some_and(|s| s >= at) && self.ledger.snapshots.iter().all(|s| s.at != at) {
                 let file = format!("policy-{at}.safetensors");
-                save_card(&policy, &self.directory.join(&file), &self.settings, &judged)?;
-                self.ledger.snapshots.push(Snapshot { at, judged: judged.clone(), file });
+                save_card(&policy, &self.directory.join(&file), &self.settings, &summary)?;
+                self.ledger.snapshots.push(Snapshot { at, evaluation: summary.clone(), file });
             }
         }
-        self.ledger.evaluations.push(judged);
+        self.ledger.evaluations.push(summary);
         Ok(())
     }
 
@@ -557,27 +558,27 @@ fn damaged(path: &Path, error: &serde_json::Error) -> Error {
     Error::Failed(format!("{}: {error}; the file is damaged", path.display()))
 }
 
-fn judged(evaluation: &Evaluation, step: u64) -> Judged {
+fn summarise(evaluation: &Evaluation, step: u64) -> EvaluationSummary {
     let (mean, std) = mean_std(&evaluation.returns);
-    Judged { step, mean, std, length: evaluation.mean_length(), score: evaluation.score }
+    EvaluationSummary { step, mean, std, length: evaluation.mean_length(), score: evaluation.score }
 }
 
-fn save_card(policy: &Policy, path: &Path, settings: &Settings, judged: &Judged) -> Result<()> {
+fn save_card(policy: &Policy, path: &Path, settings: &Settings, summary: &EvaluationSummary) -> Result<()> {
     let card = Card {
         agent: settings.agent,
         shift: settings.shift,
         role: None,
         seed: settings.seed,
-        steps: judged.step,
-        updates: judged.step.saturating_sub(settings.start) / settings.steps_per_update,
+        steps: summary.step,
+        updates: summary.step.saturating_sub(settings.start) / settings.steps_per_update,
         batch: settings.batch,
         from: settings.from.as_ref().map(Origin::describe),
         cloned_from: None,
         episodes: settings.episodes,
-        mean: judged.mean,
-        std: judged.std,
-        length: judged.length,
-        score: judged.score,
+        mean: summary.mean,
+        std: summary.std,
+        length: summary.length,
+        score: summary.score,
         program: PROGRAM.into(),
     };
     let mut parameters = policy.to_parameters();

@@ -4,7 +4,7 @@
 //! machine that others slow down shows it. FLOPs are those of the matrix products, two per multiply-add; what is not a
 //! product (activations, Adam, batches) counts as time but not as work.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -14,15 +14,15 @@ use tce_data::{
     Agent, NeighbourOptions, Rows, Shift, Standardizer, Transitions, TransportOptions, nn_distances, transport_costs,
 };
 use tce_diffusion::{
-    Denoiser, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, TrainConfig, Trainer,
+    Balance, Denoiser, Edm, NetworkConfig, Process, Request, Sampler, ScoreData, ScoreModel, TrainConfig, Trainer,
     uniform_labels,
 };
 use tce_learn::cvae::{CvaeConfig, CvaeLearner, Modelled};
 use tce_learn::sac::{Sac, SacConfig};
 use tce_learn::world_model::Worlds;
 use tce_learn::{
-    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, Lane, LearnError, Learner, Member, MetaDt,
-    MetaDtConfig, Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, train_side_by_side,
+    Bc, BcConfig, Buffer, Iql, IqlConfig, LabelConfig, LabelModels, LearnError, Learner, Member, MetaDt, MetaDtConfig,
+    Place, Regulariser, RegulariserConfig, RegulariserKind, Steps, TrainingJob, train_side_by_side,
 };
 use tce_nn::{Checkpoints, Device, is_cpu, on_threads_of, product_rate, tensor};
 use tce_run::config::Algorithm;
@@ -53,8 +53,23 @@ impl Body {
     }
 }
 
-/// Name, what it is, and how to set it up.
-type Workload = (&'static str, &'static str, fn(&On) -> Body);
+/// What is measured.
+#[derive(Clone, Copy)]
+enum Work {
+    /// Updates of a learner of the registry.
+    Method(Algorithm),
+    /// Steps of an environment.
+    Environment(Agent),
+    /// What a function sets up.
+    Own(fn(&On) -> Body),
+}
+
+/// A workload of the table.
+struct Workload {
+    name: String,
+    title: String,
+    work: Work,
+}
 
 /// What a workload runs on.
 pub struct On {
@@ -64,19 +79,14 @@ pub struct On {
     pub seeds: u64,
 }
 
-/// Every workload, in the order of the table.
-const WORKLOADS: &[Workload] = &[
+/// Name, title and how to set it up.
+type Own = (&'static str, &'static str, fn(&On) -> Body);
+
+/// What stands before the learners of the registry and the environments.
+const OWN: &[Own] = &[
     ("iql", "IQL, 17/6, 256-256, 256 rows, one seed", |on| iql(on, on.seeds, RegulariserKind::None)),
     ("iql-5", "the same, five seeds side by side (members' updates)", |on| iql(on, 5, RegulariserKind::None)),
     ("iql-kl", "IQL with the forward-KL term of Eq. 10", |on| iql(on, on.seeds, RegulariserKind::ForwardKl)),
-    ("dara", "DARA, the same sizes", |on| method(on, Algorithm::Dara)),
-    ("bosa", "BOSA", |on| method(on, Algorithm::Bosa)),
-    ("srpo", "SRPO", |on| method(on, Algorithm::Srpo)),
-    ("igdf", "IGDF", |on| method(on, Algorithm::Igdf)),
-    ("otdf", "OTDF, with its regulariser of 256-256 and 10 samples", |on| method(on, Algorithm::Otdf)),
-    ("dmc", "DmC's learner", |on| method(on, Algorithm::Dmc)),
-    ("td3-bc", "TD3+BC", |on| method(on, Algorithm::Td3Bc)),
-    ("rebrac", "ReBRAC", |on| method(on, Algorithm::Rebrac)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
     ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", |on| meta_dt(on, false)),
@@ -90,29 +100,44 @@ const WORKLOADS: &[Workload] = &[
     ("cvae", "behaviour CVAE, 256-256, 128 rows", cvae),
     ("nearest", "nearest of 5 000 target rows, 40 dimensions (Eq. 9)", |_| nearest()),
     ("transport", "Sinkhorn costs to 5 000 target rows, blocks of 2 500", |_| transport()),
-    ("env-halfcheetah", "environment steps", |_| environment(Agent::HalfCheetah)),
-    ("env-hopper", "environment steps", |_| environment(Agent::Hopper)),
-    ("env-walker2d", "environment steps", |_| environment(Agent::Walker2d)),
-    ("env-ant", "environment steps", |_| environment(Agent::Ant)),
 ];
+
+/// Every workload, in the order of the table.
+fn workloads() -> Vec<Workload> {
+    let own =
+        |&(name, title, make): &Own| Workload { name: name.to_owned(), title: title.to_owned(), work: Work::Own(make) };
+    // These have workloads of their own.
+    let apart = [Algorithm::Iql, Algorithm::Bc, Algorithm::MetaDt];
+    let methods = Algorithm::ALL.iter().filter(|a| !apart.contains(a)).map(|&algorithm| {
+        let about = algorithm.about();
+        Workload { name: about.name.to_owned(), title: about.title.to_owned(), work: Work::Method(algorithm) }
+    });
+    let environments = Agent::ALL.into_iter().map(|agent| Workload {
+        name: format!("env-{agent}"),
+        title: "environment steps".to_owned(),
+        work: Work::Environment(agent),
+    });
+    OWN.iter().map(own).chain(methods).chain(environments).collect()
+}
 
 /// The names of all workloads.
 pub fn names() -> impl Iterator<Item = &'static str> {
-    WORKLOADS.iter().map(|w| w.0)
+    static NAMES: LazyLock<Vec<String>> = LazyLock::new(|| workloads().into_iter().map(|w| w.name).collect());
+    NAMES.iter().map(String::as_str)
 }
 
 /// Whether the workload `name` needs the simulator.
 pub fn simulates(name: &str) -> bool {
-    name.starts_with("env-")
+    workloads().iter().any(|w| w.name == name && matches!(w.work, Work::Environment(_)))
 }
 
 /// How a workload did.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {
     /// Its name.
-    pub name: &'static str,
+    pub name: String,
     /// What it is.
-    pub title: &'static str,
+    pub title: String,
     /// What is counted.
     pub unit: &'static str,
     /// Units per second, median of the repeats.
@@ -132,8 +157,13 @@ pub struct Measured {
 /// # Panics
 /// If there is no such workload ([`names`]).
 pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Measured> {
-    let &(name, title, make) = WORKLOADS.iter().find(|w| w.0 == name).expect("a known workload");
-    let mut body = make(on);
+    let known = workloads().into_iter().find(|w| w.name == name);
+    let Workload { name, title, work } = known.expect("a known workload");
+    let mut body = match work {
+        Work::Method(algorithm) => method(on, algorithm),
+        Work::Environment(agent) => environment(agent),
+        Work::Own(make) => make(on),
+    };
     let mut call = || {
         (body.call)();
         // A GPU works behind the program's back.
@@ -145,7 +175,7 @@ pub fn measure(name: &str, repeats: usize, seconds: f64, on: &On) -> Result<Meas
     let mut before = product_rate(PROBE);
     for _ in 0..repeats {
         if tce_base::interrupted() {
-            return Err(tce_run::error::Error::Interrupted);
+            return Err(tce_run::error::Error::interrupted());
         }
         let started = Instant::now();
         let mut calls = 0u32;
@@ -206,18 +236,18 @@ fn members(seeds: u64) -> Vec<Member> {
 }
 
 /// Ten steps a call of learners side by side, as [`tce_run::learning`] trains them.
-fn learning<L: Learner + ?Sized + 'static>(device: &Device, lanes: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
-    let (device, seeds) = (device.clone(), lanes.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
-    let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = lanes.into_iter().unzip();
+fn learning<L: Learner + ?Sized + 'static>(device: &Device, jobs: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+    let (device, seeds) = (device.clone(), jobs.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
+    let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = jobs.into_iter().unzip();
     let mut from = 0;
     Body::new("updates", 10.0 * seeds as f64, flops, move || {
-        let mut lanes: Vec<_> = learners
+        let mut jobs: Vec<_> = learners
             .iter_mut()
             .zip(&buffers)
-            .map(|(learner, buffer)| Lane { learner: learner.as_mut(), buffer })
+            .map(|(learner, buffer)| TrainingJob { learner: learner.as_mut(), buffer })
             .collect();
         let steps = Steps { from, to: from + 10, report_every: 0 };
-        let done = train_side_by_side(&mut lanes, steps, "bench", &mut Checkpoints::none(), &device, |_, _, _| {
+        let done = train_side_by_side(&mut jobs, steps, "bench", &mut Checkpoints::none(), &device, |_, _, _| {
             Ok::<_, LearnError>(())
         });
         done.expect("nothing to fail");
@@ -232,20 +262,20 @@ fn row_products(widths: &[usize]) -> (f64, f64) {
 }
 
 /// The seeds as [`tce_run::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
-fn lanes<L>(on: &On, seeds: u64, lane: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
+fn jobs<L>(on: &On, seeds: u64, job: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
     let all = members(seeds);
     let size = if is_cpu(&on.device) { 1 } else { all.len() };
-    all.chunks(size).map(|members| lane(members.to_vec())).collect()
+    all.chunks(size).map(|members| job(members.to_vec())).collect()
 }
 
 fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
-    let config = IqlConfig { regulariser: kind, ..IqlConfig::default() };
+    let config = IqlConfig { regulariser: kind, ..IqlConfig::paper() };
     let small = RegulariserConfig {
-        cvae: CvaeConfig { hidden: vec![64], steps: 10, ..CvaeConfig::default() },
-        ..Default::default()
+        cvae: CvaeConfig { hidden: vec![64], steps: 10, ..CvaeConfig::paper() },
+        ..RegulariserConfig::paper()
     };
     let device = &on.device;
-    let lane = |members| {
+    let job = |members| {
         let buffer = Buffer::new(members, BATCH).expect("good data");
         let regulariser = Regulariser::prepare(kind, &buffer, &small, Place::NONE, device)
             .expect("defaults")
@@ -260,7 +290,7 @@ fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
     );
     // V(s) and V(s'), the gradient of V; twins: target, online, gradient; policy and gradient. No gradient of an input.
     let products = 2.0 * v + (2.0 * v - v1) + 2.0 * (2.0 * q + 2.0 * q - q1) + (3.0 * pi - pi1);
-    learning(device, lanes(on, seeds, lane), 2.0 * BATCH as f64 * products)
+    learning(device, jobs(on, seeds, job), 2.0 * BATCH as f64 * products)
 }
 
 fn sac(On { device, .. }: &On) -> Body {
@@ -279,7 +309,7 @@ fn method(on: &On, algorithm: Algorithm) -> Body {
     let mut config = layered.and_then(|l| l.config()).expect("the default preset").learner;
     (config.algorithm, config.iql.regulariser) = (algorithm, RegulariserKind::None);
     (config.behaviour.cvae.steps, config.igdf.steps, config.bosa.cvae.steps) = (1, 1, 1);
-    let lane = |mut members: Vec<Member>| {
+    let job = |mut members: Vec<Member>| {
         for member in &mut members {
             member.row_scores = Some(Arc::new((0..member.parts[1].len()).map(|i| (i % 97) as f32).collect()));
         }
@@ -287,7 +317,7 @@ fn method(on: &On, algorithm: Algorithm) -> Body {
         let learner = build(&buffer, &config, Place::NONE, &on.device).expect("defaults");
         (buffer, learner)
     };
-    learning(&on.device, lanes(on, on.seeds, lane), 0.0)
+    learning(&on.device, jobs(on, on.seeds, job), 0.0)
 }
 
 fn bc(On { device, .. }: &On) -> Body {
@@ -325,7 +355,7 @@ fn meta_dt(On { device, .. }: &On, world: bool) -> Body {
 }
 
 fn cvae(On { device, .. }: &On) -> Body {
-    let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::default() };
+    let config = CvaeConfig { hidden: vec![WIDTH, WIDTH], ..CvaeConfig::paper() };
     let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(config.batch).expect("target rows");
     let learner = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", device).expect("defaults");
     let latent = config.latent_per_action * ACT;
@@ -336,7 +366,7 @@ fn cvae(On { device, .. }: &On) -> Body {
 }
 
 fn labels(On { device, .. }: &On) -> Body {
-    let config = LabelConfig::default();
+    let config = LabelConfig::paper();
     let all = members(1);
     let models = LabelModels::new(&all, &config, device).expect("defaults");
     let buffer = Buffer::new(all, BATCH).expect("good data").target_only(config.batch).expect("target rows");
@@ -367,7 +397,7 @@ fn score_train(On { device, .. }: &On) -> Body {
     let spec = NetworkConfig::new(OBS, 1);
     // Both live as long as the process: the training data borrows them.
     let [source, target] = [table(2, 200_000), table(1, 5_000)].map(|t| &*Box::leak(Box::new(t)));
-    let data = ScoreData::labelled(&source.observations, &target.observations, OBS, true).expect("rows");
+    let data = ScoreData::labelled(&source.observations, &target.observations, OBS, Balance::Parts).expect("rows");
     let mut trainer = trainer(device, spec);
     let batch = TrainConfig::default().batch as f64;
     let inputs = (2 * spec.embedding + spec.dims * spec.width) as f64;

@@ -13,16 +13,16 @@ const FEW: usize = 3;
 pub struct Scored {
     /// Its name in tables.
     pub name: String,
-    /// Whether it is a floor: a baseline that learns from the target rows alone.
-    pub floor: bool,
+    /// Whether it is a baseline: a baseline that learns from the target rows alone.
+    pub baseline: bool,
     /// Normalised scores.
     pub scores: Vec<f64>,
 }
 
 impl Scored {
     /// Of a method.
-    pub fn new(name: &str, floor: bool, scores: &[f64]) -> Self {
-        Self { name: name.to_owned(), floor, scores: scores.to_vec() }
+    pub fn new(name: &str, baseline: bool, scores: &[f64]) -> Self {
+        Self { name: name.to_owned(), baseline, scores: scores.to_vec() }
     }
 
     fn mean(&self) -> f64 {
@@ -58,8 +58,8 @@ impl Tally {
     /// Of a method and the baselines of every task; None where they never meet.
     pub fn of(tasks: impl Iterator<Item = (Option<Scored>, Vec<Scored>)>) -> Option<Self> {
         let mut tally = Self::default();
-        for (method, floors) in tasks {
-            let (Some(method), Some(baseline)) = (method, best(&floors, |_| true)) else { continue };
+        for (method, baselines) in tasks {
+            let (Some(method), Some(baseline)) = (method, best(&baselines, |_| true)) else { continue };
             let gap = method.mean() - baseline.mean();
             let side = if gap >= 0.0 { &mut tally.above } else { &mut tally.below };
             side[0] += 1;
@@ -139,9 +139,9 @@ fn compare(method: &Scored, baseline: &Scored) -> String {
 /// A sentence for every method, one for the recommended policy (`recommended` is its name), and one about the next step.
 pub fn sentences(all: &[Scored], recommended: Option<&str>, preset: Preset) -> Vec<String> {
     let mut out = Vec::new();
-    let baseline = best(all, |s| s.floor);
+    let baseline = best(all, |s| s.baseline);
     if let Some(baseline) = baseline {
-        out.extend(all.iter().filter(|s| !s.floor && !s.scores.is_empty()).map(|method| compare(method, baseline)));
+        out.extend(all.iter().filter(|s| !s.baseline && !s.scores.is_empty()).map(|method| compare(method, baseline)));
     }
     let chosen = recommended.and_then(|name| all.iter().find(|s| s.name == name)).filter(|s| !s.scores.is_empty());
     if let (Some(chosen), Some(top)) = (chosen, best(all, |_| true)) {
@@ -159,7 +159,7 @@ pub fn sentences(all: &[Scored], recommended: Option<&str>, preset: Preset) -> V
     let seeds = all.iter().map(|s| s.scores.len()).max().unwrap_or(0);
     if preset == Preset::Quick {
         out.push("`quick` is a smoke test. For a result use --preset default --seeds 3.".into());
-    } else if (1..FEW).contains(&seeds) && baseline.is_some() && all.iter().any(|s| !s.floor) {
+    } else if (1..FEW).contains(&seeds) && baseline.is_some() && all.iter().any(|s| !s.baseline) {
         out.push("For a result that holds, run at least --seeds 3.".into());
     }
     out
@@ -169,14 +169,14 @@ pub fn sentences(all: &[Scored], recommended: Option<&str>, preset: Preset) -> V
 mod tests {
     use super::*;
 
-    fn scored(name: &str, floor: bool, scores: &[f64]) -> Scored {
-        Scored { name: name.into(), floor, scores: scores.to_vec() }
+    fn scored(name: &str, baseline: bool, scores: &[f64]) -> Scored {
+        Scored { name: name.into(), baseline, scores: scores.to_vec() }
     }
 
     #[test]
     fn the_gap_comes_first_and_then_whether_seeds_do_that() {
-        let floor = scored("BC", true, &[60.0, 62.0, 64.0]);
-        let say = |scores: &[f64]| compare(&scored("TCE(OG)", false, scores), &floor);
+        let baseline = scored("BC", true, &[60.0, 62.0, 64.0]);
+        let say = |scores: &[f64]| compare(&scored("TCE(OG)", false, scores), &baseline);
         // Standard errors: sqrt(4 / 3) = 1.155 each, 1.633 together.
         assert_eq!(
             say(&[68.0, 70.0, 72.0]),
@@ -219,13 +219,13 @@ mod tests {
 
     #[test]
     fn several_tasks_are_counted() {
-        let floors = || vec![scored("BC", true, &[60.0, 62.0, 64.0]), scored("BC, raw", true, &[5.0, 5.0, 5.0])];
+        let baselines = || vec![scored("BC", true, &[60.0, 62.0, 64.0]), scored("BC, raw", true, &[5.0, 5.0, 5.0])];
         let method = |scores: &[f64]| Some(scored("m", false, scores));
         let tasks = [
-            (method(&[68.0, 70.0, 72.0]), floors()),
-            (method(&[58.0, 60.0, 62.0]), floors()),
-            (method(&[10.0]), floors()),
-            (None, floors()),
+            (method(&[68.0, 70.0, 72.0]), baselines()),
+            (method(&[58.0, 60.0, 62.0]), baselines()),
+            (method(&[10.0]), baselines()),
+            (None, baselines()),
             (method(&[1.0]), vec![]),
         ];
         let tally = Tally::of(tasks.into_iter()).unwrap();
@@ -234,7 +234,7 @@ mod tests {
             tally.sentence("m"),
             "m: on average 15.3 below the best baseline of each task; above it on 1 of 3 (on 1 by more than seeds do), below it on 2 (0)."
         );
-        assert_eq!(Tally::of([(None, floors())].into_iter()), None);
+        assert_eq!(Tally::of([(None, baselines())].into_iter()), None);
     }
 
     #[test]

@@ -1,8 +1,4 @@
-//! The `tce` program as a library: what the command line says, and how results and errors are told. What it does stands in the other
-//! crates.
-
-// An error ends the command: nobody waits for its copy.
-#![allow(clippy::result_large_err)]
+//! The command line of `tce`: arguments, output of results and errors. The work is done by the other crates.
 
 pub mod allocator;
 mod bench;

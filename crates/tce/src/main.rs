@@ -14,7 +14,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             // The line above the bars goes away before the error stands below them.
-            tce_base::end_course(false);
+            tce_base::end_course(tce_base::LastStep::BrokenOff);
             let code = error.exit_code();
             eprint!("{}", tce::told(&error));
             ExitCode::from(code as u8)

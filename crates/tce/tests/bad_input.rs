@@ -113,7 +113,7 @@ fn options_that_would_do_something_else_are_refused() {
         ),
         (&[&learn[..], &["--learner", "iql", "--top", "0.1"]].concat(), "expected bc"),
         (&[&learn[..], &["--learner", "dara"]].concat(), "--extra FILE"),
-        (&["run", task, "--variant", "target-only,bc", "--learner", "td3-bc"], "found floors alone"),
+        (&["run", task, "--variant", "target-only,bc", "--learner", "td3-bc"], "found baselines alone"),
     ] {
         let output = tce(dir, args);
         assert_eq!(output.status.code(), Some(2), "{args:?}: {}", message(&output));

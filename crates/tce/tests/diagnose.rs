@@ -30,7 +30,7 @@ fn finished(directory: &Path, data: &[&str], more: &[&str]) -> Value {
     tce_json(directory, &[&["run", "hopper-morph:medium->expert"], more, data, TINY].concat())
 }
 
-/// The figures at one label bound.
+/// The metrics at one label bound.
 fn at(diagnosis: &Value, y: f64) -> &Value {
     diagnosis["bounds_of_y"].as_array().unwrap().iter().find(|b| b["y_max"] == y).expect("on the grid")
 }
@@ -63,8 +63,8 @@ fn a_run_is_measured_and_its_report_shows_it() {
         let b = at(&found, y);
         let share = |v: &Value| (0.0..=1.0).contains(&v.as_f64().unwrap());
         assert!(share(&b["coverage"]["target"]) && share(&b["coverage"]["source"]) && share(&b["rejected"]), "{b}");
-        for figure in ["distance", "transition_kl", "reward_difference", "reward_error", "consistency"] {
-            assert!(b["kept"][figure]["median"].as_f64().unwrap() > 0.0, "{figure} at {y}");
+        for metric in ["distance", "transition_kl", "reward_difference", "reward_error", "consistency"] {
+            assert!(b["kept"][metric]["median"].as_f64().unwrap() > 0.0, "{metric} at {y}");
         }
     }
     assert_eq!(found["task"], "hopper-morph:medium->expert");
@@ -74,8 +74,8 @@ fn a_run_is_measured_and_its_report_shows_it() {
     assert!(found["choice"]["lambda"].is_number() && at(&found, 0.2)["memorisation"]["probability"].is_number());
     assert!(found["transitions"]["groups"].as_array().unwrap().len() == 4);
     let implied = &found["implied"];
-    for figure in ["single", "mean", "between_draws", "inverse", "spread"] {
-        assert!(implied["actions"]["trained"][figure].as_f64().unwrap() > 0.0, "{figure}: {implied}");
+    for metric in ["single", "mean", "between_draws", "inverse", "spread"] {
+        assert!(implied["actions"]["trained"][metric].as_f64().unwrap() > 0.0, "{metric}: {implied}");
     }
     assert!(implied["actions"]["held_out"].is_null(), "all rows were trained on");
     assert!(implied["rollout"]["episodes"] == 2 && implied["rollout"]["score"][0].is_number(), "{implied}");
@@ -171,7 +171,7 @@ fn source_rows_of_the_targets_dynamics_have_no_discrepancy() {
     save_d4rl(&same, &random_rows(Agent::Hopper, Shift::Morph, 1500, 3), &BTreeMap::new(), &[]).unwrap();
     let diagnosed = |source: &Path, out: &str| {
         let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-        let run = finished(dir.path(), &data, &["--variant", "tce-og", "--no-floors", "--out", out]);
+        let run = finished(dir.path(), &data, &["--variant", "tce-og", "--no-baselines", "--out", out]);
         let place = run["rows"][0]["directory"].as_str().unwrap();
         tce_json(dir.path(), &[&["diagnose", place][..], &data, FEW].concat())
     };
@@ -196,7 +196,7 @@ fn networks_of_every_cycle_are_measured() {
         "--set",
         "generator.until_done={ first = 20, transition_limit = 60, gain = -100.0, held_out = 0.1 }",
     ];
-    let run = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors"];
+    let run = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-baselines"];
     tce_json(dir.path(), &[&run[..], &data, TINY, &auto].concat());
     let stages = || fs::read_dir(dir.path().join("out/stages")).unwrap().count();
     let before = stages();
@@ -222,7 +222,7 @@ fn the_seed_asked_for_is_the_one_that_is_measured() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
     let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
-    let more = ["--variant", "tce-og", "--no-floors", "--seeds", "2", "--out", "out"];
+    let more = ["--variant", "tce-og", "--no-baselines", "--seeds", "2", "--out", "out"];
     let run = finished(dir.path(), &data, &more);
     let place = run["rows"][0]["directory"].as_str().unwrap();
     // What the label models of each seed got wrong on their own held-out rows.

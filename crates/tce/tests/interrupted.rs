@@ -37,7 +37,7 @@ fn start(directory: &Path, args: &[&str]) -> Child {
 }
 
 fn pipeline(out: &str) -> Vec<&str> {
-    let task = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-floors", "--out", out];
+    let task = ["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-baselines", "--out", out];
     [&task[..], SMALL].concat()
 }
 
@@ -155,12 +155,19 @@ fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
     eprintln!("{ends} runs came to their end");
 }
 
-/// What BOSA, IGDF and Meta-DT train before their first step is gone on with too.
+/// What BOSA, IGDF and Meta-DT train before their first step is resumed too.
 #[test]
-fn rivals_killed_anywhere_learn_the_same() {
+fn prior_methods_killed_anywhere_learn_the_same() {
     let dir = tempfile::tempdir().unwrap();
-    let task =
-        ["run", "hopper-morph:medium->expert", "--variant", "bosa,igdf,otdf,meta-dt", "--no-floors", "--out", "runs"];
+    let task = [
+        "run",
+        "hopper-morph:medium->expert",
+        "--variant",
+        "bosa,igdf,otdf,meta-dt",
+        "--no-baselines",
+        "--out",
+        "runs",
+    ];
     let own = [
         "--set=learner.bosa.cvae.steps=150",
         "--set=learner.bosa.cvae.hidden=[16]",
@@ -316,7 +323,7 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
     let refuse = |what: &str| {
         let other = tce(dir.path(), &[&args("whole")[..], &["--set=learner.steps=700"]].concat());
         assert_eq!(other.status.code(), Some(2));
-        let expected = format!("found {what} learning with other settings, seeds or files");
+        let expected = format!("found {what} training run with other settings, seeds or files");
         assert!(message(&other).contains(&expected), "{}", message(&other));
     };
     refuse("the results of");

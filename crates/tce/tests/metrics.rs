@@ -10,9 +10,9 @@ use serde_json::Value;
 
 const DOCUMENTED: &str = include_str!("../../../docs/metrics.md");
 
-/// The figures of every stage; `*` in a figure stands for anything.
+/// The metrics of every stage; `*` in a metric stands for anything.
 fn documented() -> BTreeMap<String, Vec<String>> {
-    let section = DOCUMENTED.split("## Figures").nth(1).expect("the section of figures");
+    let section = DOCUMENTED.split("## Metrics").nth(1).expect("the section of metrics");
     let names = |cell: &str| cell.split('`').skip(1).step_by(2).map(str::to_owned).collect::<Vec<_>>();
     let mut stages: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for row in section.lines().filter(|l| l.starts_with("| `")) {
@@ -26,8 +26,8 @@ fn documented() -> BTreeMap<String, Vec<String>> {
     stages
 }
 
-fn is_documented(figures: &[String], name: &str) -> bool {
-    figures.iter().any(|f| match f.split_once('*') {
+fn is_documented(metrics: &[String], name: &str) -> bool {
+    metrics.iter().any(|f| match f.split_once('*') {
         Some((start, end)) => name.starts_with(start) && name.ends_with(end),
         None => f == name,
     })
@@ -37,15 +37,15 @@ fn is_documented(figures: &[String], name: &str) -> bool {
 fn lines_of_metrics_obey_their_documentation() {
     let dir = tempfile::tempdir().unwrap();
     let stages = documented();
-    // A second of each kind of training: clones, IQL with its behaviour model, every rival, both generators, both kinds of lengths.
-    let rivals = "tce-og,target-only,dara,srpo,igdf,otdf,bosa,td3-bc,rebrac,meta-dt,synther,dmc";
+    // A second of each kind of training: clones, IQL with its behaviour model, every prior method, both generators, both kinds of lengths.
+    let methods = "tce-og,target-only,dara,srpo,igdf,otdf,bosa,td3-bc,rebrac,meta-dt,synther,dmc";
     let small = [
         "--set",
-        "joint.steps=40",
+        "single_stage.steps=40",
         "--set",
-        "joint.rows=600",
+        "single_stage.rows=600",
         "--set",
-        "joint.width=32",
+        "single_stage.width=32",
         "--set",
         "learner.bosa.cvae.steps=20",
         "--set",
@@ -57,7 +57,7 @@ fn lines_of_metrics_obey_their_documentation() {
         "--set",
         "evaluation.every=30",
         "--no-verdict",
-        "--no-floors",
+        "--no-baselines",
     ];
     let (source, target) = common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
     let (source, target) = (source.display().to_string(), target.display().to_string());
@@ -73,7 +73,7 @@ fn lines_of_metrics_obey_their_documentation() {
         "until-done",
     ];
     for args in [
-        [&task[..], &[rivals], TINY, &small].concat(),
+        [&task[..], &[methods], TINY, &small].concat(),
         [&task[..], &["tce-og"], TINY, &small, &until_done].concat(),
         vec![
             "train-sac",
@@ -101,21 +101,21 @@ fn lines_of_metrics_obey_their_documentation() {
             let object = line.as_object().expect(&told);
             let stage = object["stage"].as_str().expect(&told);
             assert!(object["step"].is_u64() && object["member"].is_u64(), "{told}");
-            let figures = stages.get(stage).unwrap_or_else(|| panic!("{told}: the stage is not documented"));
+            let metrics = stages.get(stage).unwrap_or_else(|| panic!("{told}: the stage is not documented"));
             for (name, value) in object.iter().filter(|(n, _)| !["stage", "step", "member"].contains(&n.as_str())) {
-                assert!(is_documented(figures, name), "{told}: {name} is not documented");
+                assert!(is_documented(metrics, name), "{told}: {name} is not documented");
                 assert!(value.is_number() || value.is_null(), "{told}");
                 seen.insert((stage.to_owned(), name.clone()));
             }
         }
     }
     // Nothing is documented that nobody writes.
-    for (stage, figures) in &stages {
-        for figure in figures {
-            let written = seen.iter().any(|(s, name)| s == stage && is_documented(std::slice::from_ref(figure), name));
-            let elsewhere = stage == "learn" && figure == "critic_penalty"
-                || (stage == "state" && figure == "implied_action_error");
-            assert!(written || elsewhere, "{stage}: {figure} is documented, and was not written");
+    for (stage, metrics) in &stages {
+        for metric in metrics {
+            let written = seen.iter().any(|(s, name)| s == stage && is_documented(std::slice::from_ref(metric), name));
+            let elsewhere = stage == "learn" && metric == "critic_penalty"
+                || (stage == "state" && metric == "implied_action_error");
+            assert!(written || elsewhere, "{stage}: {metric} is documented, and was not written");
         }
     }
 }

@@ -55,7 +55,7 @@ fn without_mujoco_data_are_checked_and_learned_from() {
         &["data", "check", target][..],
         &[learn, &short].concat(),
         &[
-            "judge",
+            "compare",
             "policy/policy.safetensors",
             "--source",
             source,

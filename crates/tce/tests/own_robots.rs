@@ -125,7 +125,7 @@ fn torques_stay_torques() {
     let output = tce(
         dir,
         &[
-            "judge",
+            "compare",
             "policy/policy-seed0.safetensors",
             "--target",
             "target.hdf5",

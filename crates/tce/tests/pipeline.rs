@@ -29,7 +29,7 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
     let (first, again, two) = (run("one", "1"), run("again", "1"), run("two", "2"));
     let scores =
         |v: &serde_json::Value| v["rows"].as_array().unwrap().iter().map(|r| r["scores"].clone()).collect::<Vec<_>>();
-    assert_eq!(scores(&first).len(), 7, "five floors and two variants");
+    assert_eq!(scores(&first).len(), 7, "five baselines and two variants");
     assert_eq!(scores(&first), scores(&again));
     assert_eq!(scores(&first), scores(&two));
     let [a, b, c] = ["one", "again", "two"].map(|o| results(&dir.path().join(o)));
@@ -96,19 +96,19 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert_eq!(rows_of("tce-no-reg"), whole, "no filter by default");
     let at = args.iter().position(|a| *a == variants).unwrap();
     args[at] = "tce-no-reg";
-    args.extend(["--no-floors", "--set", "filter.enabled=true"]);
+    args.extend(["--no-baselines", "--set", "filter.enabled=true"]);
     let filtered = tce_json(dir.path(), &args)["rows"][0]["extra_rows"].as_u64().unwrap();
     assert!(filtered < whole && filtered > 0, "the filter rejects something, not all: {filtered}");
 }
 
-/// Every rival and both of its modes, beside TCE's own rows under another learner.
+/// Every prior method and both of its modes, beside TCE's own rows under another learner.
 #[test]
-fn every_rival_runs_and_says_its_mode() {
+fn every_prior_method_runs_and_says_its_mode() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Kinematic);
     let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
     let run = |rest: &[&str]| {
-        let mut args = vec!["run", "hopper-kinematic:medium->medium", "--no-floors", "--out", "out"];
+        let mut args = vec!["run", "hopper-kinematic:medium->medium", "--no-baselines", "--out", "out"];
         args.extend(data);
         args.extend(rest);
         args.extend(TINY);
@@ -119,18 +119,18 @@ fn every_rival_runs_and_says_its_mode() {
         ]);
         tce_json(dir.path(), &args)
     };
-    let rivals = ["dara", "bosa", "srpo", "igdf", "otdf"];
-    let both: Vec<String> = rivals.iter().flat_map(|r| [r.to_string(), format!("{r}-published")]).collect();
+    let methods = ["dara", "bosa", "srpo", "igdf", "otdf"];
+    let both: Vec<String> = methods.iter().flat_map(|r| [r.to_string(), format!("{r}-published")]).collect();
     let report = run(&["--variant", &format!("{},td3-bc,rebrac", both.join(","))]);
     let rows = report["rows"].as_array().unwrap();
     assert_eq!(rows.len(), 12);
     for row in rows {
         assert!(row["scores"][0].is_number(), "{row}");
         let published = row["variant"].as_str().unwrap().ends_with("-published");
-        let rival = rivals.iter().any(|r| row["variant"].as_str().unwrap().starts_with(r));
+        let prior = methods.iter().any(|r| row["variant"].as_str().unwrap().starts_with(r));
         assert_eq!(row["title"].as_str().unwrap().ends_with(" (published)"), published);
         assert_eq!(row["mode"] == "published", published);
-        assert_eq!(row["mode"] == "corrected", rival && !published);
+        assert_eq!(row["mode"] == "corrected", prior && !published);
         let left = files(&dir.path().join(row["directory"].as_str().unwrap()));
         assert!(left.iter().all(|p| p.extension().is_none_or(|e| e != "checkpoint")), "{left:?}");
         let metrics =
@@ -173,29 +173,30 @@ fn learners_are_listed_and_learn_from_two_files() {
         let mut args =
             vec!["learn", "--learner", name, "--target", "target.hdf5", "--extra", "source.hdf5", "--out", name];
         args.extend(TINY);
-        args.extend(["--set=joint.scores.reference=500", "--set=learner.steps=3", "--set=learner.igdf.steps=5"]);
+        args.extend(["--set=single_stage.scores.reference=500", "--set=learner.steps=3", "--set=learner.igdf.steps=5"]);
         args.extend(["--set=learner.bosa.cvae.steps=5", "--set=learner.meta_dt.world_model.steps=5"]);
         let learned = tce_json(dir.path(), &args);
         assert!(dir.path().join(learned["policies"][0].as_str().unwrap()).exists(), "{name}");
-        // No rival has TCE's own term.
+        // No prior method has TCE's own term.
         let config = fs::read_to_string(dir.path().join(name).join("config.toml")).unwrap();
         let plain = config.contains("regulariser = \"none\"");
         assert_eq!(plain, ["dara", "srpo", "igdf"].contains(&name.as_str()), "{name}");
     }
 }
 
-/// Rivals whose rows come from one network over whole transitions: the same bytes at any thread count, one stage for both forms of
+/// Prior methods whose rows come from one network over whole transitions: the same bytes at any thread count, one stage for both forms of
 /// DmC, scores beside generated rows, and nothing of the source for SynthER.
 #[test]
-fn rivals_of_whole_transitions_run() {
+fn prior_methods_of_whole_transitions_run() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Ant, Shift::Morph);
     let run = |out: &str, threads: &str, sets: &[&str]| {
-        let mut args = vec!["run", "ant-morph:medium->expert", "--variant", "synther,dmc,dmc-published", "--no-floors"];
+        let mut args =
+            vec!["run", "ant-morph:medium->expert", "--variant", "synther,dmc,dmc-published", "--no-baselines"];
         args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
         args.extend(["--out", out, "--threads", threads]);
         args.extend(TINY);
-        args.extend(["--set", "joint.scores.reference=500", "--set", "learner.behaviour.cvae.hidden=[32]"]);
+        args.extend(["--set", "single_stage.scores.reference=500", "--set", "learner.behaviour.cvae.hidden=[32]"]);
         args.extend(["--set", "evaluation.episodes=1", "--set", "learner.behaviour.samples=3"]);
         args.extend(sets);
         tce_json(dir.path(), &args)
@@ -248,7 +249,8 @@ fn rivals_of_whole_transitions_run() {
 fn the_papers_preset_runs() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Ant, Shift::Morph);
-    let mut args = vec!["run", "ant-morph:medium->expert", "--preset", "paper", "--variant", "tce-nn", "--no-floors"];
+    let mut args =
+        vec!["run", "ant-morph:medium->expert", "--preset", "paper", "--variant", "tce-nn", "--no-baselines"];
     args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
     args.extend(TINY);
     args.extend(["--set", "generator.rows=0", "--set", "learner.behaviour.cvae.hidden=[32]"]);
@@ -302,19 +304,19 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     args.extend(&TINY[10..]);
     let learned = tce_json(dir.path(), &args);
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
-    // The recommended policy is one of those that were tried: of the learner's, or of the floor.
+    // The recommended policy is one of those that were tried: of the learner's, or of the baseline.
     let verdict = &learned["verdict"];
     assert_eq!(verdict["tried"].as_array().unwrap().len(), 2, "{verdict}");
     let recommended = fs::read(dir.path().join("policy/policy.safetensors")).unwrap();
     assert!(recommended == fs::read(dir.path().join(verdict["policy"].as_str().unwrap())).unwrap());
     assert!(verdict["reason"].as_str().unwrap().contains("is recommended"), "{verdict}");
     let both = ["policy/policy-seed0.safetensors", "policy/policy.safetensors"];
-    let judge =
+    let data =
         ["--source", "source.hdf5", "--target", "target.hdf5", "--dynamics-steps", "20", "--fitted-q-steps", "0"];
-    let judged = tce_json(dir.path(), &[&["judge"][..], &both, &judge].concat());
-    assert!(judged["policies"].as_array().unwrap().len() == 2 && judged["held_out"][0].is_number(), "{judged}");
-    assert_eq!(judged["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
-    let foreign = tce(dir.path(), &[&["judge", "zoo.safetensors"][..], &judge].concat());
+    let compared = tce_json(dir.path(), &[&["compare"][..], &both, &data].concat());
+    assert!(compared["policies"].as_array().unwrap().len() == 2 && compared["held_out"][0].is_number(), "{compared}");
+    assert_eq!(compared["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
+    let foreign = tce(dir.path(), &[&["compare", "zoo.safetensors"][..], &data].concat());
     assert_eq!(foreign.status.code(), Some(1), "no such policy");
 
     let policy = "policy/policy-seed1.safetensors";
@@ -353,7 +355,7 @@ fn a_policy_with_a_memory_is_learned_evaluated_and_collected_with() {
     };
     let learned = learn("one", "1");
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
-    assert!(learned["figures"]["policy_loss"][1].is_number());
+    assert!(learned["metrics"]["policy_loss"][1].is_number());
     assert_eq!(learn("two", "2")["evaluations"], learned["evaluations"]);
     let files = ["one", "two"].map(|o| fs::read(dir.path().join(o).join("policy-seed1.safetensors")).unwrap());
     assert!(files[0] == files[1], "another number of threads gave another policy");
@@ -376,7 +378,8 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Walker2d, Shift::Morph);
     let run = |threads: &str, out: &str| {
-        let mut args = vec!["run", "walker2d-morph:medium->expert", "--no-floors", "--out", out, "--threads", threads];
+        let mut args =
+            vec!["run", "walker2d-morph:medium->expert", "--no-baselines", "--out", out, "--threads", threads];
         args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
         args.extend(TINY);
         args.extend(["--set", "generator.state_steps=\"auto\"", "--set", "generator.transition_steps=\"auto\""]);
@@ -390,7 +393,7 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
     let policies = ["one", "two"]
         .map(|out| fs::read(dir.path().join(out).join("walker2d-morph_medium-to-expert/policy.safetensors")).unwrap());
     assert!(policies[0] == policies[1] && one["verdict"]["tried"].as_array().unwrap().len() == 1);
-    let stages = common::files(&dir.path().join("one/stages"));
+    let stages = files(&dir.path().join("one/stages"));
     let cycles = |name: &str| {
         let names = stages.iter().filter_map(|p| p.file_name()?.to_str());
         let mut steps: Vec<u64> =
@@ -410,7 +413,7 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
 fn an_interrupted_run_continues_where_it_was() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
-    let mut args = vec!["run", "hopper-morph:medium->expert", "--no-floors", "--out", "out"];
+    let mut args = vec!["run", "hopper-morph:medium->expert", "--no-baselines", "--out", "out"];
     args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
     args.extend(TINY);
     let mut endless = args.clone();

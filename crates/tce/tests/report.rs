@@ -9,7 +9,7 @@ use common::{message, tce, tce_json};
 use serde_json::{Value, json};
 use tce_base::sha256_hex;
 
-/// A planned sweep of two tasks, one method and the floors, without results.
+/// A planned sweep of two tasks, one method and the baselines, without results.
 fn plan(directory: &Path) -> Vec<Value> {
     let text = "tasks = [\"hopper-morph:medium->*\"]\nvariants = [\"tce-og\"]\nseeds = 2\npreset = \"quick\"\n\
                 [[overrides]]\nname = \"<b>&y\"\nset = [\"generator.y_max=0.1\"]\n";
@@ -36,7 +36,7 @@ fn write_run(directory: &Path, seeds: &[u64], scores: &[f64], config: &str) -> V
     files
 }
 
-/// Gives every run of the sweep a result, better for the method than for the floors. Returns the records.
+/// Gives every run of the sweep a result, better for the method than for the baselines. Returns the records.
 fn fill(sweep: &Path, manifest: &[Value]) -> Vec<PathBuf> {
     let mut records = Vec::new();
     fs::create_dir_all(sweep.join("done")).unwrap();

@@ -20,7 +20,7 @@ fn a_sweep_ends_with_every_result_right() {
     let file = describe(dir.path(), "mine", 2);
     let planned = tce_json(dir.path(), &["sweep", "plan", &file]);
     assert_eq!(
-        (&planned["run"], &planned["expand"], &planned["source"], &planned["target"]),
+        (&planned["run"], &planned["augment"], &planned["source"], &planned["target"]),
         (&6.into(), &2.into(), &1.into(), &1.into())
     );
     let folder = "runs/sweeps/mine";
@@ -45,7 +45,7 @@ fn a_sweep_ends_with_every_result_right() {
             "hopper-morph:medium->expert",
             "--variant",
             "tce-og",
-            "--no-floors",
+            "--no-baselines",
             "--from-zoo",
             "--seed",
             "1",

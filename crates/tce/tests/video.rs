@@ -42,15 +42,15 @@ fn decode(path: &Path) -> Decoded {
     out
 }
 
-fn film(dir: &Path, env: &str, out: &str, more: &[&str]) -> serde_json::Value {
+fn video(dir: &Path, env: &str, out: &str, more: &[&str]) -> serde_json::Value {
     let args = ["evaluate", POLICY, "--env", env, "--episodes", "2", "--seed", "3", "--video", out];
     tce_json(dir, &[&args[..], &SMALL, more].concat())
 }
 
 #[test]
-fn a_film_shows_the_episodes_that_the_table_counts() {
+fn a_video_shows_the_episodes_that_the_table_counts() {
     let dir = tempfile::tempdir().unwrap();
-    let report = film(dir.path(), "hopper-morph", "film.gif", &["--video-seconds", "2"]);
+    let report = video(dir.path(), "hopper-morph", "video.gif", &["--video-seconds", "2"]);
     let (shown, returns) = (&report[0]["video"], &report[0]["returns"]);
     let names: Vec<_> = shown["panels"].as_array().unwrap().iter().map(|p| p["environment"].clone()).collect();
     assert_eq!(names, ["hopper-source", "hopper-morph"]);
@@ -61,15 +61,15 @@ fn a_film_shows_the_episodes_that_the_table_counts() {
     assert_eq!(shown["panels"][0]["return"], source[0]["returns"][0]);
     assert!(source[0].get("video").is_none());
     let plain = tce_json(dir.path(), &["evaluate", POLICY, "--env", "hopper-morph", "--episodes", "2", "--seed", "3"]);
-    assert_eq!(&plain[0]["returns"], returns, "filming changes nothing");
+    assert_eq!(&plain[0]["returns"], returns, "a video changes nothing");
 
     // 2 s of 25 pictures.
-    let decoded = decode(&dir.path().join("film.gif"));
+    let decoded = decode(&dir.path().join("video.gif"));
     assert_eq!((decoded.size, decoded.pictures.len(), decoded.endless), ([642, 240], 50, true));
     assert!(decoded.delays.iter().all(|&delay| delay == 4), "{:?}", decoded.delays);
     assert!((1..50).all(|k| decoded.pictures[k] != decoded.pictures[k - 1]), "something moves in every picture");
     assert_eq!(shown["frames"], 50);
-    assert_eq!(shown["bytes"], fs::metadata(dir.path().join("film.gif")).unwrap().len());
+    assert_eq!(shown["bytes"], fs::metadata(dir.path().join("video.gif")).unwrap().len());
     assert_eq!(files(dir.path()).len(), 1, "nothing is left beside it");
 }
 
@@ -78,20 +78,20 @@ fn the_same_bytes_at_any_number_of_threads() {
     let dir = tempfile::tempdir().unwrap();
     let short = ["--video-seconds", "1", "--threads"];
     let bytes = |out: &str, threads: &str| {
-        film(dir.path(), "hopper", out, &[&short[..], &[threads]].concat());
+        video(dir.path(), "hopper", out, &[&short[..], &[threads]].concat());
         fs::read(dir.path().join(out)).unwrap()
     };
     let one = bytes("one.gif", "1");
     assert!(one == bytes("three.gif", "3"));
     // Without a shift there is nothing to compare with: one panel.
     assert_eq!(decode(&dir.path().join("one.gif")).size, [320, 240]);
-    let other = film(dir.path(), "hopper", "other.gif", &["--video-seconds", "1", "--sample"]);
+    let other = video(dir.path(), "hopper", "other.gif", &["--video-seconds", "1", "--sample"]);
     assert_eq!(other[0]["video"]["panels"].as_array().unwrap().len(), 1);
     assert!(one != fs::read(dir.path().join("other.gif")).unwrap());
 }
 
 #[test]
-fn what_cannot_become_a_film_is_refused_before_any_work() {
+fn what_cannot_become_a_video_is_refused_before_any_work() {
     let dir = tempfile::tempdir().unwrap();
     let refused = |args: &[&str], code: i32, words: &[&str]| {
         let path = dir.path().join("nothing");
@@ -104,10 +104,10 @@ fn what_cannot_become_a_film_is_refused_before_any_work() {
         }
         assert!(!message.contains("draw"), "{message}");
     };
-    refused(&[POLICY, "--video", "film.webm"], 2, &["film.webm", "`.webm`", ".gif or .mp4"]);
-    refused(&[POLICY, "--video", "film"], 2, &["film", "no ending", ".gif or .mp4"]);
-    refused(&[POLICY, POLICY, "--video", "film.gif"], 2, &["film.gif", "2 policies", "expected one"]);
-    refused(&[POLICY, "--video", "film.mp4"], 1, &["film.mp4", "ffmpeg", "PATH", "apt install ffmpeg", ".gif"]);
+    refused(&[POLICY, "--video", "video.webm"], 2, &["video.webm", "`.webm`", ".gif or .mp4"]);
+    refused(&[POLICY, "--video", "video"], 2, &["video", "no ending", ".gif or .mp4"]);
+    refused(&[POLICY, POLICY, "--video", "video.gif"], 2, &["video.gif", "2 policies", "expected one"]);
+    refused(&[POLICY, "--video", "video.mp4"], 1, &["video.mp4", "ffmpeg", "PATH", "apt install ffmpeg", ".gif"]);
     refused(&[POLICY, "--video", "f.gif", "--video-seconds", "0"], 2, &["--video-seconds", "found 0", "0.1"]);
     refused(&[POLICY, "--video", "f.gif", "--video-speed", "NaN"], 2, &["--video-speed", "NaN"]);
     refused(&[POLICY, "--video", "f.gif", "--video-size", "481x360"], 2, &["481x360", "even"]);
@@ -116,7 +116,7 @@ fn what_cannot_become_a_film_is_refused_before_any_work() {
     fs::write(dir.path().join("mine.gif"), b"precious").unwrap();
     refused(&[POLICY, "--video", "mine.gif"], 2, &["mine.gif", "exists", "--force"]);
     assert_eq!(fs::read(dir.path().join("mine.gif")).unwrap(), b"precious");
-    film(dir.path(), "hopper", "mine.gif", &["--force", "--video-seconds", "0.2"]);
+    video(dir.path(), "hopper", "mine.gif", &["--force", "--video-seconds", "0.2"]);
     assert_eq!(decode(&dir.path().join("mine.gif")).pictures.len(), 5);
 }
 
@@ -136,21 +136,21 @@ fn ffmpeg_gets_every_pixel_and_its_complaints_are_passed_on() {
         fs::write(&ffmpeg, script).unwrap();
         fs::set_permissions(&ffmpeg, fs::Permissions::from_mode(0o755)).unwrap();
         let path = format!("{}:/usr/bin:/bin", tools.display());
-        let args = ["evaluate", POLICY, "--env", "hopper-morph", "--episodes", "1", "--video", "film.mp4"];
+        let args = ["evaluate", POLICY, "--env", "hopper-morph", "--episodes", "1", "--video", "video.mp4"];
         let args = [&args[..], &SMALL, &["--video-seconds", "0.4", "--force"]].concat();
         program(dir.path(), &args).env("PATH", path).output().unwrap()
     };
     let output = run(" V libx264", "wc -c > \"$out\"; echo \"$*\" >> \"$out\"");
     assert!(output.status.success(), "{}", message(&output));
-    let told = fs::read_to_string(dir.path().join("film.mp4")).unwrap();
+    let told = fs::read_to_string(dir.path().join("video.mp4")).unwrap();
     assert_eq!(told.split_whitespace().next(), Some((10 * 642 * 240 * 3).to_string().as_str()));
     for words in ["-video_size 642x240", "-framerate 1000000/40000", "-pix_fmt yuv420p", "libx264"] {
         assert!(told.contains(words), "{words}: {told}");
     }
-    let whole = fs::read(dir.path().join("film.mp4")).unwrap();
+    let whole = fs::read(dir.path().join("video.mp4")).unwrap();
     let output = run(" V libx264", "cat > /dev/null; echo 'no space on the moon' >&2; exit 3");
     assert_eq!(output.status.code(), Some(1));
-    assert!(message(&output).contains("film.mp4") && message(&output).contains("no space on the moon"));
+    assert!(message(&output).contains("video.mp4") && message(&output).contains("no space on the moon"));
     // It goes before it has read anything.
     let output = run(" V libx264", "echo 'not today' >&2; exit 4");
     assert_eq!(output.status.code(), Some(1));
@@ -158,16 +158,16 @@ fn ffmpeg_gets_every_pixel_and_its_complaints_are_passed_on() {
     let output = run(" V mpeg4", "cat > /dev/null");
     assert_eq!(output.status.code(), Some(1));
     assert!(message(&output).contains("libx264"), "{}", message(&output));
-    assert!(fs::read(dir.path().join("film.mp4")).unwrap() == whole, "what failed replaces nothing");
+    assert!(fs::read(dir.path().join("video.mp4")).unwrap() == whole, "what failed replaces nothing");
     assert_eq!(files(dir.path()).len(), 2, "nothing is left beside it");
 }
 
-/// A film that takes long, interrupted: exit code 130, and nothing is left.
+/// A video that takes long, interrupted: exit code 130, and nothing is left.
 #[cfg(unix)]
 #[test]
-fn an_interrupted_film_leaves_nothing() {
+fn an_interrupted_video_leaves_nothing() {
     let dir = tempfile::tempdir().unwrap();
-    let args = ["evaluate", POLICY, "--env", "hopper-morph", "--video", "film.gif", "--video-size", "1920x1080"];
+    let args = ["evaluate", POLICY, "--env", "hopper-morph", "--video", "video.gif", "--video-size", "1920x1080"];
     let mut child = silent(dir.path(), &args).spawn().unwrap();
     // The file in the making is there before the work begins, and after signals are listened to.
     let started = Instant::now();
@@ -190,12 +190,12 @@ fn an_mp4_where_there_is_ffmpeg() {
     }
     let dir = tempfile::tempdir().unwrap();
     for out in ["one.mp4", "two.mp4"] {
-        let report = film(dir.path(), "hopper-morph", out, &["--video-seconds", "1"]);
+        let report = video(dir.path(), "hopper-morph", out, &["--video-seconds", "1"]);
         assert_eq!(report[0]["video"]["frames"], 25);
     }
     let bytes = fs::read(dir.path().join("one.mp4")).unwrap();
     assert_eq!(&bytes[4..8], b"ftyp");
-    assert!(bytes == fs::read(dir.path().join("two.mp4")).unwrap(), "the same film has the same bytes");
+    assert!(bytes == fs::read(dir.path().join("two.mp4")).unwrap(), "the same video has the same bytes");
     let output = tce(dir.path(), &["evaluate", POLICY, "--env", "hopper", "--video", "one.mp4"]);
     assert_eq!(output.status.code(), Some(2), "it exists");
 }

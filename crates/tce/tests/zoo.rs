@@ -58,7 +58,7 @@ fn a_task_needs_no_files() {
     let dir = tempfile::tempdir().unwrap();
     let run = |out: &str, task: &str| {
         let args =
-            ["run", task, "--variant", "target-source", "--no-floors", "--set", "source.rows=2000", "--out", out];
+            ["run", task, "--variant", "target-source", "--no-baselines", "--set", "source.rows=2000", "--out", out];
         tce_json(dir.path(), &[&args[..], TINY].concat())
     };
     let report = run("one", "hopper-morph:medium->expert");

@@ -44,7 +44,13 @@ pub fn from_columns(columns: Columns, name: &Path, options: &LoadOptions) -> Res
     };
     let rows = rewards.len();
     if rows == 0 || obs_dim == 0 || act_dim == 0 {
-        let field = if obs_dim == 0 { "observations" } else if act_dim == 0 { "actions" } else { "rewards" };
+        let field = if obs_dim == 0 {
+            "observations"
+        } else if act_dim == 0 {
+            "actions"
+        } else {
+            "rewards"
+        };
         let expected = "at least one row, and one column of states and of actions".to_owned();
         return invalid(Problem::Empty, field, "an empty array".into(), expected, "Record more of this robot");
     }

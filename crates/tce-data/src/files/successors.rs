@@ -39,5 +39,6 @@ pub(super) fn fill_gaps(
 
 /// What the user is told of them.
 pub(super) fn told_gaps(name: &str, gaps: usize) -> Option<String> {
-    (gaps > 0).then(|| format!("`{name}` is not finite in {gaps} terminal rows, whose next state is taken as not known"))
+    (gaps > 0)
+        .then(|| format!("`{name}` is not finite in {gaps} terminal rows, whose next state is taken as not known"))
 }

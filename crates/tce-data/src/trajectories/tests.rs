@@ -19,7 +19,7 @@ fn data(trajectories: &[(usize, f32, End)], seed: u64) -> Transitions {
         for i in 0..rows {
             let r = reward * ((i + 1) as f32 / 50.0).min(1.0) * rng.random_range(0.98f32..1.02);
             let last = i + 1 == rows;
-            t.push(&[0.0], &[0.0], r, &[0.0], last && end == End::Fall, last && end == End::Limit);
+            t.push(&[0.0], &[0.0], r, &[0.0], last && end == Fall, last && end == Limit);
         }
     }
     t
@@ -60,7 +60,7 @@ fn falls_tell_where_the_pace_does_not() {
 }
 
 #[test]
-fn a_cut_trajectory_is_judged_by_its_age() {
+fn a_cut_trajectory_is_ranked_by_its_age() {
     for (reward, keep) in [(1.0, false), (3.0, true)] {
         for rows in [30, 100, 300, 800] {
             let t = data(

@@ -1,4 +1,5 @@
 use super::*;
+use crate::Balance;
 use crate::{Condition, Edm, Part, Ve, Vp};
 use std::collections::BTreeMap;
 use tce_nn::burn::module::{ModuleVisitor, Param};
@@ -119,7 +120,7 @@ fn members_learn_as_they_would_alone() {
 fn misfits_are_refused() {
     let (x, _) = rows(50);
     let part = Part { rows: &x, condition: Condition::Constant(vec![0.0]) };
-    let data = [ScoreData::new(vec![part], 3, 1, true).unwrap()];
+    let data = [ScoreData::new(vec![part], 3, 1, Balance::Parts).unwrap()];
     let process = Process::Vp(Vp::default());
     let new = |config| Trainer::new("t", small(), process, config, &[Streams::new(1)], &cpu());
     let error = new(TrainConfig::default())

@@ -42,6 +42,7 @@ use crate::training::{Learner, Meter};
 
 const ABOUT: About = About {
     name: "bc",
+    title: "BC",
     description: "behaviour cloning; of the best trajectories with learner.top",
     reference: "Pomerleau 1989",
     published: None,

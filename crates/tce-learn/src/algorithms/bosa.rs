@@ -37,7 +37,7 @@ use crate::actor::ActorConfig;
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
 use crate::cvae::{Cvae, CvaeConfig, CvaeLearner, Density, Modelled};
-use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, UpdateRule};
 use crate::error::{LearnError, within};
 use crate::losses::{member_mean, squared_td_error};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
@@ -49,6 +49,7 @@ use crate::training::{Learner, Meter, Place, prepare};
 
 const ABOUT: About = About {
     name: "bosa",
+    title: "BOSA",
     description: "deterministic actor-critic on the support of dynamics and behaviour models",
     reference: "Liu et al. 2024; ODRL",
     published: Some("critics bootstrap at terminal rows and nowhere else"),
@@ -136,7 +137,7 @@ impl Default for BosaConfig {
             ensemble: 5,
             samples: 1,
             std: 0.125f64.sqrt(),
-            cvae: CvaeConfig { hidden: vec![256, 256], steps: 5000, batch: 256, ..CvaeConfig::default() },
+            cvae: CvaeConfig { hidden: vec![256, 256], steps: 5000, batch: 256, ..CvaeConfig::paper() },
             discount: 0.99,
             delay: DelayConfig::default(),
             critic_lr: 3e-4,
@@ -256,7 +257,7 @@ pub fn critic_target(batch: &Minibatch, q: Tensor<3>, discount: f64, mode: Mode)
     batch.r.clone() + bootstrap * q * discount
 }
 
-impl Rule for Support {
+impl UpdateRule for Support {
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, behaviour, members, .. } = self;
         let (mask, y) = rayon::join(

@@ -33,13 +33,14 @@ use crate::iql::{Iql, IqlConfig};
 use crate::losses::member_mean;
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
-use crate::on_iql::{OnIql, Shape};
+use crate::on_iql::{BatchTransform, OnIql};
 use crate::regulariser::Regulariser;
 use crate::selection::need_others;
 use crate::training::{Meter, member_noise};
 
 const ABOUT: About = About {
     name: "dara",
+    title: "DARA",
     description: "IQL; source rewards lowered where two classifiers tell the domains apart",
     reference: "Liu et al. 2022; ODRL",
     published: Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
@@ -139,13 +140,13 @@ impl Dara {
         let classifier = |name: &str, inputs: usize| {
             Trained::new(MlpConfig::relu(inputs, &config.hidden, 2).init(&members, name, &train))
         };
-        let shape = Classifiers {
+        let transform = Classifiers {
             sas: classifier("dara sas", 2 * s + a),
             sa: classifier("dara sa", s + a),
             buffer: buffer.clone().with_stream("dara batch"),
             config: config.clone(),
         };
-        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape })
+        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, transform })
     }
 }
 
@@ -179,8 +180,14 @@ fn join(batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
     (Tensor::cat(vec![sa.clone(), batch.s2.clone()], 2), sa)
 }
 
-impl Shape for Classifiers {
-    fn shape(&mut self, _iql: &Iql, batch: &Minibatch, step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+impl BatchTransform for Classifiers {
+    fn transform(
+        &mut self,
+        _iql: &Iql,
+        batch: &Minibatch,
+        step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>) {
         let Self { config: c, sas, sa, buffer } = self;
         let (members, device) = (&buffer.streams(), &batch.s.device());
         let rows = buffer.sample(step, device);

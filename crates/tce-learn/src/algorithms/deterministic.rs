@@ -143,18 +143,18 @@ impl ActorCritic {
 }
 
 /// How a method trains the networks of an [`ActorCritic`].
-pub trait Rule: Send {
+pub trait UpdateRule: Send {
     /// One step; `step` counts from 0.
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter);
 }
 
-/// An [`ActorCritic`] under a [`Rule`].
+/// An [`ActorCritic`] under a [`UpdateRule`].
 pub struct Deterministic<R> {
     pub(crate) nets: ActorCritic,
     pub(crate) rule: R,
 }
 
-impl<R: Rule> Learner for Deterministic<R> {
+impl<R: UpdateRule> Learner for Deterministic<R> {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
         self.rule.update(&mut self.nets, batch, step, meter);
     }
@@ -170,7 +170,7 @@ impl<R: Rule> Learner for Deterministic<R> {
     }
 }
 
-impl<R: Rule> PolicyLearner for Deterministic<R> {
+impl<R: UpdateRule> PolicyLearner for Deterministic<R> {
     fn policies(&self) -> Vec<Policy> {
         self.nets.actor.policies()
     }

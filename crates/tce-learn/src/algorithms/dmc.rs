@@ -36,7 +36,7 @@ use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
-use crate::on_iql::{OnIql, Shape};
+use crate::on_iql::{BatchTransform, OnIql};
 use crate::otdf::otdf_policy;
 use crate::regulariser::{Regulariser, RegulariserConfig};
 use crate::selection::{Selected, need_scores, scores_of_others};
@@ -44,6 +44,7 @@ use crate::training::Meter;
 
 const ABOUT: About = About {
     name: "dmc",
+    title: "DmC",
     description: "OTDF's policy; source and guided generated rows chosen and weighed by nearest neighbours",
     reference: "DmC, ECAI 2025",
     published: Some("OTDF's broadcast, and a behaviour model that is never trained"),
@@ -140,12 +141,12 @@ impl Dmc {
         config.check()?;
         need_scores("DmC", buffer.members())?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(OnIql { iql, shape: Scored { config: config.clone(), members: buffer.members().to_vec() } })
+        Ok(OnIql { iql, transform: Scored { config: config.clone(), members: buffer.members().to_vec() } })
     }
 }
 
-impl Shape for Scored {
-    fn shape(
+impl BatchTransform for Scored {
+    fn transform(
         &mut self,
         _iql: &Iql,
         batch: &Minibatch,
@@ -165,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_modes_differ_in_two_things_only() {
-        let (base, regulariser) = (IqlConfig::default(), RegulariserConfig::default());
+        let (base, regulariser) = (IqlConfig::paper(), RegulariserConfig::paper());
         let config = |mode| DmcConfig { mode, ..DmcConfig::default() };
         let (published, corrected) = (config(Mode::Published), config(Mode::Corrected));
         let (a, b) = (published.backbone(&base), corrected.backbone(&base));

@@ -34,7 +34,7 @@ use crate::iql::{Iql, IqlConfig};
 use crate::losses::{binary_cross_entropy, member_mean};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
-use crate::on_iql::{OnIql, Shape};
+use crate::on_iql::{BatchTransform, OnIql};
 use crate::policy::PolicyLearner;
 use crate::regulariser::Regulariser;
 use crate::selection::{Selected, host_from, need_others};
@@ -42,6 +42,7 @@ use crate::training::{Learner, Meter, Place, prepare};
 
 const ABOUT: About = About {
     name: "igdf",
+    title: "IGDF",
     description: "IQL; source rows chosen by a contrastive model of the target's dynamics",
     reference: "Wen et al. 2024; ODRL",
     published: Some("the contrastive model is never trained; with code = \"authors\", no row weighs more than another"),
@@ -234,12 +235,12 @@ impl Igdf {
                 return Ok(None);
             }
         }
-        Ok(Some(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape: encoders }))
+        Ok(Some(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, transform: encoders }))
     }
 }
 
-impl Shape for Encoders {
-    fn shape(
+impl BatchTransform for Encoders {
+    fn transform(
         &mut self,
         _iql: &Iql,
         batch: &Minibatch,
@@ -307,10 +308,10 @@ mod tests {
         let shaped = |mode| {
             let small = IgdfConfig { hidden: vec![8], features: 4, steps: 3, batch: 4, ..IgdfConfig::default() };
             let config = IgdfConfig { mode, code: Code::Authors, ..small };
-            let iql = IqlConfig { hidden: vec![8], ..IqlConfig::default() };
+            let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
             let igdf = Igdf::new(&buffer, &config, &iql, Regulariser::None, 1, Place::NONE, &cpu());
             let mut igdf = igdf.unwrap().unwrap();
-            let (batch, weights) = igdf.shape.shape(&igdf.iql, &batch, 3, &mut Meter::default());
+            let (batch, weights) = igdf.transform.transform(&igdf.iql, &batch, 3, &mut Meter::default());
             (batch.picks, host(weights.unwrap()))
         };
         let ((rows, own), (same_rows, alike)) = (shaped(Mode::Corrected), shaped(Mode::Published));

@@ -47,6 +47,7 @@ use crate::training::{Learner, Meter};
 
 const ABOUT: About = About {
     name: "iql",
+    title: "IQL",
     description: "implicit Q-learning, TCE's learner",
     reference: "Kostrikov et al. 2022; TCE, B.2",
     published: None,

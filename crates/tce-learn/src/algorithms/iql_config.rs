@@ -23,7 +23,7 @@ pub enum PolicyExtraction {
 
 /// The configuration of [`crate::Iql`]; see [`crate::iql`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default = "IqlConfig::paper")]
 pub struct IqlConfig {
     /// τ_V, the expectile of Q that V is regressed on. Source: Eq. B.12, Appendix B.2.
     #[schemars(range(min = 0.0, max = 1.0))]
@@ -60,8 +60,9 @@ pub struct IqlConfig {
     pub regulariser: RegulariserKind,
 }
 
-impl Default for IqlConfig {
-    fn default() -> Self {
+impl IqlConfig {
+    /// Appendix B.2 without the behaviour term: the paper's IQL*. What measures best is in the presets of `tce-run`.
+    pub fn paper() -> Self {
         Self {
             expectile: 0.7,
             temperature: 3.0,

@@ -48,6 +48,7 @@ use crate::world_model::{SegmentTensors, WorldModelConfig, Worlds};
 
 const ABOUT: About = About {
     name: "meta-dt",
+    title: "Meta-DT*",
     description: "a decision transformer on contexts of a world model, zero-shot",
     reference: "Meta-DT 2024",
     published: None,
@@ -263,7 +264,7 @@ impl Learner for MetaDt {
     /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
     fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, buffer, device, worlds, members } = self;
-        let mut figures = Vec::new();
+        let mut metrics = Vec::new();
         for (m, nets) in members.iter_mut().enumerate() {
             let (trajectories, encoder) = worlds.member(m);
             // Other segments than the world model's.
@@ -272,12 +273,12 @@ impl Learner for MetaDt {
             let of = Of { trajectories, encoder, buffer, member: m, device };
             let loss = policy_loss(nets.actions(&segments, of, c, &mut dropout), &segments, device);
             if meter.active() {
-                figures.push(host(loss.clone())[0] as f64);
+                metrics.push(host(loss.clone())[0] as f64);
             }
             nets.transformer.step(loss, c.rate(step));
         }
         if meter.active() {
-            meter.add("policy_loss", figures);
+            meter.add("policy_loss", metrics);
         }
     }
 

@@ -20,6 +20,9 @@ use crate::training::Place;
 pub struct About {
     /// Its name on the command line and in `learner.algorithm`.
     pub name: &'static str,
+    /// Its name in tables.
+    #[serde(skip)]
+    pub title: &'static str,
     /// One line.
     pub description: &'static str,
     /// Whose it is.

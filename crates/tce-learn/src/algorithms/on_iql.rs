@@ -10,9 +10,15 @@ use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Learner, Meter};
 
 /// What a method does to a batch before IQL learns from it.
-pub trait Shape: Send {
+pub trait BatchTransform: Send {
     /// The batch of `step` that IQL gets, and what multiplies the rows of its L_Q. Networks of the method's own are trained here.
-    fn shape(&mut self, iql: &Iql, batch: &Minibatch, step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>);
+    fn transform(
+        &mut self,
+        iql: &Iql,
+        batch: &Minibatch,
+        step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>);
 
     /// Adds networks of its own to `state`.
     fn save(&self, _state: &mut NamedParameters) {}
@@ -26,31 +32,31 @@ pub trait Shape: Send {
     }
 }
 
-/// IQL on the batches of a [`Shape`].
+/// IQL on the batches of a [`BatchTransform`].
 pub struct OnIql<S> {
     pub(crate) iql: Iql,
-    pub(crate) shape: S,
+    pub(crate) transform: S,
 }
 
-impl<S: Shape> Learner for OnIql<S> {
+impl<S: BatchTransform> Learner for OnIql<S> {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let (batch, weights) = self.shape.shape(&self.iql, batch, step, meter);
+        let (batch, weights) = self.transform.transform(&self.iql, batch, step, meter);
         self.iql.step(&batch, weights, step, meter);
     }
 
     fn state(&self) -> NamedParameters {
         let mut state = self.iql.state();
-        self.shape.save(&mut state);
+        self.transform.save(&mut state);
         state
     }
 
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         self.iql.restore(state, path)?;
-        self.shape.load(state, path)
+        self.transform.load(state, path)
     }
 }
 
-impl<S: Shape> PolicyLearner for OnIql<S> {
+impl<S: BatchTransform> PolicyLearner for OnIql<S> {
     fn policies(&self) -> Vec<Policy> {
         self.iql.policies()
     }

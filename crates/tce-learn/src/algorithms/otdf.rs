@@ -35,13 +35,14 @@ use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig, PolicyExtraction};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
-use crate::on_iql::{OnIql, Shape};
+use crate::on_iql::{BatchTransform, OnIql};
 use crate::regulariser::{Regulariser, RegulariserKind};
 use crate::selection::{Selected, need_scores, scores_of_others};
 use crate::training::Meter;
 
 const ABOUT: About = About {
     name: "otdf",
+    title: "OTDF",
     description: "IQL; source rows chosen by optimal transport, policy held to the target's behaviour",
     reference: "Lyu et al. 2025",
     published: Some("advantages have no effect on which action is cloned (a broadcast)"),
@@ -143,7 +144,7 @@ impl Otdf {
         config.check()?;
         need_scores("OTDF", buffer.members())?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(OnIql { iql, shape: Transported { config: config.clone(), members: buffer.members().to_vec() } })
+        Ok(OnIql { iql, transform: Transported { config: config.clone(), members: buffer.members().to_vec() } })
     }
 }
 
@@ -156,8 +157,8 @@ pub fn normalise(d: &mut [f32], others: usize) {
     }
 }
 
-impl Shape for Transported {
-    fn shape(
+impl BatchTransform for Transported {
+    fn transform(
         &mut self,
         _iql: &Iql,
         batch: &Minibatch,
@@ -184,7 +185,7 @@ mod tests {
 
     #[test]
     fn the_modes_differ_in_policy_extraction_alone() {
-        let iql = IqlConfig::default();
+        let iql = IqlConfig::paper();
         let of = |mode| OtdfConfig { mode, ..OtdfConfig::default() }.backbone(&iql);
         let (published, corrected) = (of(Mode::Published), of(Mode::Corrected));
         assert_eq!(published.policy_extraction, PolicyExtraction::MeanWeight);

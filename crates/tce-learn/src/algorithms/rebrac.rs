@@ -25,7 +25,7 @@ use tce_nn::{Device, MlpConfig};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
-use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, UpdateRule};
 use crate::error::{LearnError, within};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::td3_bc::normalised_value;
@@ -33,6 +33,7 @@ use crate::training::Meter;
 
 const ABOUT: About = About {
     name: "rebrac",
+    title: "ReBRAC",
     description: "TD3+BC with a penalty in the critics too, and normalised critics",
     reference: "Tarasov et al. 2023",
     published: None,
@@ -125,7 +126,7 @@ impl Rebrac {
     }
 }
 
-impl Rule for Penalties {
+impl UpdateRule for Penalties {
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, buffer } = self;
         let a2 = nets.next_action(batch.s2.clone(), step);

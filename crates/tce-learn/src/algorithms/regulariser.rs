@@ -43,7 +43,7 @@ pub enum RegulariserKind {
 
 /// The constants of the terms; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default = "RegulariserConfig::paper")]
 pub struct RegulariserConfig {
     /// The behaviour model.
     pub cvae: CvaeConfig,
@@ -55,9 +55,10 @@ pub struct RegulariserConfig {
     pub std: f64,
 }
 
-impl Default for RegulariserConfig {
-    fn default() -> Self {
-        Self { cvae: CvaeConfig::default(), draws: 8, samples: 10, std: 0.1f64.sqrt() }
+impl RegulariserConfig {
+    /// The constants of OTDF and of the paper.
+    pub fn paper() -> Self {
+        Self { cvae: CvaeConfig::paper(), draws: 8, samples: 10, std: 0.1f64.sqrt() }
     }
 }
 

@@ -48,7 +48,7 @@ impl Selected {
         Self { weights: tensor(weights, [p, kept, 1], &batch.s.device()), batch: batch.keep(&rows) }
     }
 
-    /// As [`crate::on_iql::Shape`] hands it on; the mean weight goes to `meter`.
+    /// As [`crate::on_iql::BatchTransform`] hands it on; the mean weight goes to `meter`.
     pub(crate) fn recorded(self, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
         meter.record("critic_weight", &member_mean(self.weights.clone()));
         (self.batch, Some(self.weights))

@@ -16,7 +16,7 @@
 //! | - | `mode` | corrected | published: x is the logit D(s) itself |
 //!
 //! IGDF's authors stand it on another IQL (Gaussian log-likelihood for the policy: `learner.iql.policy_extraction = "awr_logprob"`); here all
-//! rivals stand on the same one.
+//! prior methods stand on the same one.
 //!
 //! **Published**: the logit is clamped where the odds are meant. Every state with D(s) ≤ .1 (odds below 1.1) then loses λ ln 10,
 //! however unlike it is, and ln of a logit grows hardly at all.
@@ -32,13 +32,14 @@ use crate::iql::{Iql, IqlConfig};
 use crate::losses::binary_cross_entropy;
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
-use crate::on_iql::{OnIql, Shape};
+use crate::on_iql::{BatchTransform, OnIql};
 use crate::regulariser::Regulariser;
 use crate::selection::{best_others, kept_rows};
 use crate::training::Meter;
 
 const ABOUT: About = About {
     name: "srpo",
+    title: "SRPO",
     description: "IQL; rewards raised where the state looks like one of high value",
     reference: "Xue et al. 2023; IGDF's repository",
     published: Some("the discriminator's logit is clamped where its odds are meant"),
@@ -129,8 +130,8 @@ impl Srpo {
         config.check()?;
         let net = MlpConfig::relu(buffer.inputs().len(), &config.hidden, 1);
         let net = net.init(&buffer.streams(), "srpo", &device.clone().autodiff());
-        let shape = Discriminator { config: config.clone(), net: Trained::new(net) };
-        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, shape })
+        let transform = Discriminator { config: config.clone(), net: Trained::new(net) };
+        Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, transform })
     }
 }
 
@@ -155,8 +156,14 @@ pub fn reward_shift(logits: Tensor<3>, config: &SrpoConfig) -> Tensor<3> {
     log * config.lambda
 }
 
-impl Shape for Discriminator {
-    fn shape(&mut self, iql: &Iql, batch: &Minibatch, _step: u64, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
+impl BatchTransform for Discriminator {
+    fn transform(
+        &mut self,
+        iql: &Iql,
+        batch: &Minibatch,
+        _step: u64,
+        meter: &mut Meter,
+    ) -> (Minibatch, Option<Tensor<3>>) {
         let Self { config: c, net } = self;
         let labels = high_value_labels(iql.values(batch.s.clone()), c.share);
         let loss = binary_cross_entropy(net.net().forward(batch.s.clone()), labels);

@@ -23,7 +23,7 @@ use tce_nn::{Device, MlpConfig, Tensor};
 use crate::actor::{Actor, ActorConfig};
 use crate::buffer::{Buffer, Minibatch};
 use crate::critic::state_action;
-use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, Rule};
+use crate::deterministic::{ActorCritic, DelayConfig, Deterministic, UpdateRule};
 use crate::error::{LearnError, within};
 use crate::losses::member_mean;
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
@@ -31,6 +31,7 @@ use crate::training::Meter;
 
 const ABOUT: About = About {
     name: "td3-bc",
+    title: "TD3+BC",
     description: "TD3 with a behaviour-cloning term",
     reference: "Fujimoto and Gu 2021",
     published: None,
@@ -114,7 +115,7 @@ pub fn normalised_value(q: Tensor<3>) -> Tensor<3> {
     member_mean(q) / Tensor::from_inner(scale)
 }
 
-impl Rule for Td3BcConfig {
+impl UpdateRule for Td3BcConfig {
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let q = nets.next_value(batch.s2.clone(), nets.next_action(batch.s2.clone(), step));
         let y = batch.r.clone() + batch.not_done.clone() * q * self.discount;

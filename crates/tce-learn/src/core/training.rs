@@ -12,10 +12,10 @@ use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, o
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
 
-/// Losses and other figures are taken every so many steps: they cost time, and their means need no more. A prime, because what a
+/// Metrics are computed every so many steps: more would cost time and not change their means. A prime, because what a
 /// method does at every second step is to be seen too.
 const METER_EVERY: u64 = 11;
-/// Steps of a lane before the next one's turn.
+/// Steps of a job before the next one's turn.
 const TURN: u64 = 50;
 
 /// Where a training keeps its checkpoints, and what tells it from others.
@@ -23,26 +23,26 @@ const TURN: u64 = 50;
 pub struct Place<'a> {
     /// The directory; none keeps nothing, for trainings of seconds and tests.
     pub directory: Option<&'a Path>,
-    /// A word that stands for all that decides the result.
+    /// Cache key: hash of all that decides the result.
     pub key: &'a str,
     /// Which of several trainings side by side.
-    pub lane: usize,
-    /// Takes the figures of what is trained before the first step.
+    pub job: usize,
+    /// Takes the metrics of what is trained before the first step.
     pub journal: Option<&'a Journal>,
 }
 
-/// The figures of preparations, from lanes that may run side by side.
+/// The metrics of preparations, from jobs that may run side by side.
 #[derive(Debug, Default)]
 pub struct Journal(Mutex<Vec<(usize, String, Report)>>);
 
 impl Journal {
-    /// Lane, training and report, in the order of lanes and steps, whatever the order in which they came.
+    /// Job, training and report, in the order of jobs and steps, whatever the order in which they came.
     ///
     /// # Panics
-    /// If a lane has panicked.
+    /// If a job has panicked.
     pub fn take(&self) -> Vec<(usize, String, Report)> {
-        let mut reports = std::mem::take(&mut *self.0.lock().expect("no lane has panicked"));
-        reports.sort_by_key(|(lane, ..)| *lane);
+        let mut reports = std::mem::take(&mut *self.0.lock().expect("no job has panicked"));
+        reports.sort_by_key(|(job, ..)| *job);
         reports
     }
 }
@@ -54,7 +54,7 @@ const PREPARATION_REPORTS: u64 = 10;
 
 impl Place<'_> {
     /// Nothing is kept.
-    pub const NONE: Place<'static> = Place { directory: None, key: "", lane: 0, journal: None };
+    pub const NONE: Place<'static> = Place { directory: None, key: "", job: 0, journal: None };
 
     /// The checkpoints of the training `name` here.
     ///
@@ -67,7 +67,7 @@ impl Place<'_> {
         })
     }
 
-    /// Removes what [`prepare`] kept, for all lanes: the result is on disk.
+    /// Removes what [`prepare`] kept, for all jobs: the result is on disk.
     pub fn discard_preparations(&self) {
         let entries = self.directory.and_then(|d| std::fs::read_dir(d).ok());
         for entry in entries.into_iter().flatten().flatten() {
@@ -80,8 +80,8 @@ impl Place<'_> {
     }
 }
 
-/// Trains what a learner needs before its first step: `steps` steps on `buffer`, gone on with from the checkpoints at `place`, where
-/// the end is kept too. Its figures go to the journal of `place`. False if the user interrupted it.
+/// Trains what a learner needs before its first step: `steps` steps on `buffer`, resumed from the checkpoints at `place`, where
+/// the end is kept too. Its metrics go to the journal of `place`. False if the user interrupted it.
 ///
 /// # Errors
 /// If a checkpoint cannot be read or written.
@@ -93,15 +93,15 @@ pub fn prepare<L: Learner>(
     place: Place<'_>,
     device: &Device,
 ) -> Result<bool, LearnError> {
-    let name = format!("{PREPARATION}-{}-{}", label.replace(' ', "-"), place.lane);
+    let name = format!("{PREPARATION}-{}-{}", label.replace(' ', "-"), place.job);
     let mut checkpoints = place.checkpoints(&name)?;
-    let mut lanes = [Lane { learner, buffer }];
+    let mut jobs = [TrainingJob { learner, buffer }];
     let steps = Steps::new(steps, (steps / PREPARATION_REPORTS).max(1));
     let training = label.replace(' ', "-").to_lowercase();
-    let outcome = advance(&mut lanes, steps, label, &mut checkpoints, true, device, |_, report, _| {
+    let outcome = advance(&mut jobs, steps, label, &mut checkpoints, true, device, |_, report, _| {
         if let Some(journal) = place.journal {
-            let mut reports = journal.0.lock().expect("no lane has panicked");
-            reports.push((place.lane, training.clone(), report.clone()));
+            let mut reports = journal.0.lock().expect("no job has panicked");
+            reports.push((place.job, training.clone(), report.clone()));
         }
         Ok::<_, LearnError>(())
     })?;
@@ -110,7 +110,7 @@ pub fn prepare<L: Learner>(
 
 /// Something that is trained one minibatch at a time, P members at once.
 pub trait Learner: Send {
-    /// One step. `step` counts from 0; figures go to `meter`.
+    /// One step. `step` counts from 0; metrics go to `meter`.
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter);
 
     /// All parameters and optimiser states: what [`Learner::restore`] needs to go on as if nothing had happened.
@@ -132,7 +132,7 @@ pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 
     tensor(noise, shape, device)
 }
 
-/// Means of named figures, per member.
+/// Means of named metrics, per member.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Meter {
     #[serde(skip)]
@@ -163,22 +163,22 @@ mod bits {
 }
 
 impl Meter {
-    /// A meter that takes every figure.
+    /// A meter that takes every metric.
     pub fn always() -> Self {
         Self { active: true, ..Self::default() }
     }
 
-    /// Whether figures are wanted at this step; learners ask before they compute any.
+    /// Whether metrics are wanted at this step; learners ask before they compute any.
     pub fn active(&self) -> bool {
         self.active
     }
 
-    /// An empty meter that is as active, for work on another thread; [`Meter::join`] takes its figures back.
+    /// An empty meter that is as active, for work on another thread; [`Meter::join`] takes its metrics back.
     pub fn fork(&self) -> Self {
         Self { active: self.active, ..Self::default() }
     }
 
-    /// Takes the figures of a [`Meter::fork`].
+    /// Takes the metrics of a [`Meter::fork`].
     pub fn join(&mut self, fork: Self) {
         for (name, (values, count)) in fork.sums {
             let (sum, n) = self.sums.entry(name).or_insert_with(|| (vec![0.0; values.len()], 0));
@@ -198,7 +198,7 @@ impl Meter {
         }
     }
 
-    /// Takes one figure per member.
+    /// Takes one metric per member.
     pub fn add(&mut self, name: &str, per_member: Vec<f64>) {
         let (sum, count) = self.sums.entry(name.to_owned()).or_insert_with(|| (vec![0.0; per_member.len()], 0));
         sum.iter_mut().zip(per_member).for_each(|(s, v)| *s += v);
@@ -217,18 +217,18 @@ impl Meter {
 pub struct Report {
     /// Steps done.
     pub step: u64,
-    /// Mean of each figure since the last report, per member.
+    /// Mean of each metric since the last report, per member.
     pub metrics: BTreeMap<String, Vec<f64>>,
 }
 
 impl From<(u64, Meter)> for Report {
-    fn from((step, mut figures): (u64, Meter)) -> Self {
-        Self { step, metrics: figures.take() }
+    fn from((step, mut metrics): (u64, Meter)) -> Self {
+        Self { step, metrics: metrics.take() }
     }
 }
 
 impl Report {
-    /// Members with a figure that is not a finite number: their training has diverged. The others do not feel it.
+    /// Members with a metric that is not a finite number: their training has diverged. The others do not feel it.
     pub fn diverged(&self) -> Vec<usize> {
         let members = self.metrics.values().map(Vec::len).max().unwrap_or(0);
         let bad = |m: &usize| self.metrics.values().any(|v| v.get(*m).is_some_and(|x| !x.is_finite()));
@@ -264,14 +264,14 @@ pub struct Outcome {
 }
 
 /// A learner and the rows it learns from.
-pub struct Lane<'a, L: ?Sized> {
+pub struct TrainingJob<'a, L: ?Sized> {
     /// The learner.
     pub learner: &'a mut L,
     /// Its rows.
     pub buffer: &'a Buffer,
 }
 
-/// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one lane.
+/// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one job.
 ///
 /// # Errors
 /// That of `on_report`, and those of the checkpoints.
@@ -284,38 +284,38 @@ pub fn train<L: Learner + ?Sized, E: From<LearnError>>(
     device: &Device,
     mut on_report: impl FnMut(&Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    let mut lanes = [Lane { learner, buffer }];
-    train_side_by_side(&mut lanes, steps, label, checkpoints, device, |_, report, l| on_report(report, l))
+    let mut jobs = [TrainingJob { learner, buffer }];
+    train_side_by_side(&mut jobs, steps, label, checkpoints, device, |_, report, l| on_report(report, l))
 }
 
-/// Trains the learners of all lanes, with one progress bar named `label`.
+/// Trains the learners of all jobs, with one progress bar named `label`.
 ///
-/// Lanes take the threads in turns of a few steps, so that three lanes keep two cores busy; what a lane learns does not
-/// depend on the others, nor on the number of threads. `on_report` gets the lane, the means of its figures and its learner,
+/// Jobs take the threads in turns of a few steps, so that three jobs keep two cores busy; what a job learns does not
+/// depend on the others, nor on the number of threads. `on_report` gets the job, the means of its metrics and its learner,
 /// to evaluate or save it; its error ends the training. The learners' device is the one of their parameters; batches are
 /// made on `device`, each while the update before it runs.
 ///
-/// With `checkpoints` the training goes on from the newest one, and keeps one now and then and when the user interrupts: the
+/// With `checkpoints` the training resumes from the newest one, and keeps one at intervals and when the user interrupts: the
 /// result and all reports are then those of an undisturbed training. A training that is done leaves them to the caller, who removes
 /// them once the result is safe.
 ///
 /// # Errors
 /// That of `on_report`; if a checkpoint does not fit the learners or cannot be written.
 pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
-    lanes: &mut [Lane<L>],
+    jobs: &mut [TrainingJob<L>],
     steps: Steps,
     label: &str,
     checkpoints: &mut Checkpoints,
     device: &Device,
     on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    advance(lanes, steps, label, checkpoints, false, device, on_report)
+    advance(jobs, steps, label, checkpoints, false, device, on_report)
 }
 
 /// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own. Its reports are in the
 /// checkpoints and are all given at the end, those of an earlier process and of one that had nothing left to do included.
 fn advance<L: Learner + ?Sized, E: From<LearnError>>(
-    lanes: &mut [Lane<L>],
+    jobs: &mut [TrainingJob<L>],
     steps: Steps,
     label: &str,
     checkpoints: &mut Checkpoints,
@@ -323,7 +323,7 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
     device: &Device,
     mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    let mut runs: Vec<_> = lanes.iter_mut().map(Run::new).collect();
+    let mut runs: Vec<_> = jobs.iter_mut().map(Run::new).collect();
     let mut step = steps.from;
     if let Some((at, state, path)) = checkpoints.restore() {
         for (k, run) in runs.iter_mut().enumerate() {
@@ -353,8 +353,8 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
         step = turn.end;
         if step == due {
             for (k, run) in runs.iter_mut().enumerate() {
-                let figures = (step, std::mem::take(&mut run.meter));
-                let report = Report::from(figures.clone());
+                let metrics = (step, std::mem::take(&mut run.meter));
+                let report = Report::from(metrics.clone());
                 for member in report.diverged() {
                     tce_base::note!(
                         "{label}: member {} has diverged at step {step} (a loss is not finite)",
@@ -362,8 +362,8 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
                     );
                 }
                 match keep_end {
-                    true => run.history.push(figures),
-                    false => on_report(k, &report, run.lane.learner)?,
+                    true => run.history.push(metrics),
+                    false => on_report(k, &report, run.job.learner)?,
                 }
             }
         }
@@ -375,60 +375,60 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
         }
         for (k, run) in runs.iter_mut().enumerate() {
             for report in std::mem::take(&mut run.history).into_iter().map(Report::from) {
-                on_report(k, &report, run.lane.learner)?;
+                on_report(k, &report, run.job.learner)?;
             }
         }
     }
     Ok(Outcome { step: steps.to.max(steps.from), interrupted: false })
 }
 
-/// The state of all lanes.
+/// The state of all jobs.
 fn state_of<L: Learner + ?Sized>(runs: &[Run<L>]) -> NamedParameters {
     let mut state = NamedParameters::default();
     runs.iter().enumerate().for_each(|(k, run)| run.keep(k, &mut state));
     state
 }
 
-/// A lane under way.
+/// A job under way.
 struct Run<'a, 'b, L: ?Sized> {
-    lane: &'a mut Lane<'b, L>,
+    job: &'a mut TrainingJob<'b, L>,
     meter: Meter,
-    /// Figures that were due and are given at the end, with their steps.
+    /// Metrics that were due and are given at the end, with their steps.
     history: Vec<(u64, Meter)>,
     /// The batch of the next step.
     next: Option<Minibatch>,
 }
 
 impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
-    fn new(lane: &'a mut Lane<'b, L>) -> Self {
-        Self { lane, meter: Meter::default(), history: Vec::new(), next: None }
+    fn new(job: &'a mut TrainingJob<'b, L>) -> Self {
+        Self { job, meter: Meter::default(), history: Vec::new(), next: None }
     }
 
-    /// Adds the state of this lane, number `k`, to a checkpoint.
+    /// Adds the state of this job, number `k`, to a checkpoint.
     fn keep(&self, k: usize, state: &mut NamedParameters) {
-        let own = self.lane.learner.state();
+        let own = self.job.learner.state();
         state.extend_under(&format!("{k}/"), own);
-        let figures = serde_json::to_string(&(&self.meter, &self.history)).expect("plain data");
-        state.metadata.insert(format!("{k}/meter"), figures);
+        let metrics = serde_json::to_string(&(&self.meter, &self.history)).expect("plain data");
+        state.metadata.insert(format!("{k}/meter"), metrics);
     }
 
     /// Puts back what [`Run::keep`] added.
     fn restore(&mut self, k: usize, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         let mut own = state.under(&format!("{k}/"));
         // Until November 2026 there was no history.
-        let figures = |text: String| {
+        let metrics = |text: String| {
             serde_json::from_str(&text).ok().or_else(|| Some((serde_json::from_str(&text).ok()?, Vec::new())))
         };
-        let meter = own.metadata.remove("meter").and_then(figures);
+        let meter = own.metadata.remove("meter").and_then(metrics);
         (self.meter, self.history) = meter.ok_or_else(|| NetworkError::Format {
             path: path.to_owned(),
-            reason: format!("no figures of lane {k}, so no checkpoint of this training; remove it to begin anew"),
+            reason: format!("no metrics of job {k}, so no checkpoint of this training; remove it to begin anew"),
         })?;
-        self.lane.learner.restore(&own, path)
+        self.job.learner.restore(&own, path)
     }
 
     fn advance(&mut self, turn: std::ops::Range<u64>, end: u64, device: &Device, progress: &Progress) {
-        let Lane { learner, buffer } = self.lane;
+        let TrainingJob { learner, buffer } = self.job;
         for step in turn {
             let batch = self.next.take().unwrap_or_else(|| buffer.sample(step, device));
             self.meter.active = step % METER_EVERY == 0;

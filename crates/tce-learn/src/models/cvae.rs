@@ -38,7 +38,7 @@ const LOG_STD_RANGE: (f32, f32) = (-4.0, 15.0);
 
 /// The configuration of a [`CvaeLearner`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default = "CvaeConfig::paper")]
 pub struct CvaeConfig {
     /// Widths of the hidden layers of encoder and decoder. Source: OTDF, 750 and 750.
     pub hidden: Vec<usize>,
@@ -54,8 +54,9 @@ pub struct CvaeConfig {
     pub batch: usize,
 }
 
-impl Default for CvaeConfig {
-    fn default() -> Self {
+impl CvaeConfig {
+    /// OTDF's, which the paper takes over.
+    pub fn paper() -> Self {
         Self { hidden: vec![750, 750], latent_per_action: 2, kl_weight: 0.5, lr: 1e-3, steps: 10_000, batch: 128 }
     }
 }
@@ -278,7 +279,7 @@ mod tests {
             row_scores: None,
         };
         let buffer = Buffer::new(vec![member], 1).unwrap();
-        let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::default() };
+        let config = CvaeConfig { hidden: vec![8], ..CvaeConfig::paper() };
         let cvae = CvaeLearner::new(&buffer, &config, Modelled::Behaviour, "cvae", &cpu()).unwrap().model();
         let mut weights = NamedParameters::default();
         weights.collect("cvae", &cvae);

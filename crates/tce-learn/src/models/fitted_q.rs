@@ -35,7 +35,7 @@ use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, host, tensor};
 use crate::buffer::{Buffer, Member, Minibatch};
 use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
-use crate::training::{Lane, Learner, Meter, Steps, train_side_by_side};
+use crate::training::{Learner, Meter, Steps, TrainingJob, train_side_by_side};
 
 /// Rows of a block of the bootstrap, at most.
 const BLOCK: usize = 50;
@@ -219,12 +219,12 @@ pub fn fitted_q(
         }
     }
     let buffers = draws.iter().map(|(_, buffer)| buffer).cycle();
-    let mut lanes: Vec<_> =
-        learners.iter_mut().zip(buffers).map(|(learner, buffer)| Lane { learner, buffer }).collect();
+    let mut jobs: Vec<_> =
+        learners.iter_mut().zip(buffers).map(|(learner, buffer)| TrainingJob { learner, buffer }).collect();
     let nothing = |_: usize, _: &crate::training::Report, _: &FittedQ| Ok::<_, LearnError>(());
     let steps = Steps::new(config.steps, 0);
-    let outcome = train_side_by_side(&mut lanes, steps, "fitted Q", checkpoints, device, nothing)?;
-    drop(lanes);
+    let outcome = train_side_by_side(&mut jobs, steps, "fitted Q", checkpoints, device, nothing)?;
+    drop(jobs);
     if outcome.interrupted {
         return Ok(None);
     }

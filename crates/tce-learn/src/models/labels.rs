@@ -30,7 +30,7 @@ use crate::training::{Learner, Meter, Steps, train};
 
 /// The configuration of [`train_labels`]; see the [module](self).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default = "LabelConfig::paper")]
 pub struct LabelConfig {
     /// The networks.
     pub model: PairConfig,
@@ -45,8 +45,9 @@ pub struct LabelConfig {
     pub learn_terminals: bool,
 }
 
-impl Default for LabelConfig {
-    fn default() -> Self {
+impl LabelConfig {
+    /// The length and batches of Table C.4, with networks on s' - s (the paper's see s').
+    pub fn paper() -> Self {
         Self { model: PairConfig::default(), steps: 39_000, batch: 128, held_out: 0.05, learn_terminals: false }
     }
 }

@@ -210,19 +210,19 @@ impl Learner for Worlds {
     /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
     fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, buffer, device, members } = self;
-        let mut figures: [Vec<f64>; 2] = Default::default();
+        let mut metrics: [Vec<f64>; 2] = Default::default();
         for (m, (trajectories, model)) in members.iter_mut().enumerate() {
             let segments = trajectories.sample(buffer, m, step, [c.batch, 1, c.horizon]);
             let batch = SegmentTensors::new(&segments, 1, device);
             let losses = model.net().losses(&batch, strip(&segments, c.batch, device));
             if meter.active() {
-                figures.iter_mut().zip(&losses).for_each(|(f, loss)| f.push(host(loss.clone())[0] as f64));
+                metrics.iter_mut().zip(&losses).for_each(|(f, loss)| f.push(host(loss.clone())[0] as f64));
             }
             let [state, reward] = losses;
             model.step(state + reward, c.lr);
         }
         if meter.active() {
-            ["world_state_loss", "world_reward_loss"].iter().zip(figures).for_each(|(name, f)| meter.add(name, f));
+            ["world_state_loss", "world_reward_loss"].iter().zip(metrics).for_each(|(name, f)| meter.add(name, f));
         }
     }
 

@@ -49,7 +49,7 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
     let published: Vec<bool> = study
         .methods
         .iter()
-        .map(|m| m.variant.ends_with("-published") || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
+        .map(|m| m.published || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
         .collect();
     let warnings = warnings::warnings(study, &tasks, &scores, comparison.as_ref(), &published);
     Ok(Analysis {
@@ -102,8 +102,8 @@ fn shift_table(
         let stats: Vec<Option<(f64, Option<f64>)>> =
             scores[t].iter().map(|s| (!s.is_empty()).then(|| mean_std(s))).collect();
         let best = stats.iter().flatten().map(|s| s.0).fold(f64::MIN, f64::max);
-        let floors = stats.iter().zip(methods).filter(|(_, m)| m.floor).filter_map(|(s, _)| s.map(|s| s.0));
-        let floor = floors.reduce(f64::max);
+        let baselines = stats.iter().zip(methods).filter(|(_, m)| m.baseline).filter_map(|(s, _)| s.map(|s| s.0));
+        let baseline = baselines.reduce(f64::max);
         let cell = |(k, stat): (usize, &Option<(f64, Option<f64>)>)| {
             stat.map(|(mean, std)| Cell {
                 mean,
@@ -111,7 +111,7 @@ fn shift_table(
                 seeds: scores[t][k].len(),
                 diverged: by_task[t][k].iter().filter(|r| matches!(r.member.verdict, Verdict::Diverged(_))).count(),
                 best: mean >= best,
-                above_floors: if methods[k].floor { None } else { floor.map(|f| mean > f) },
+                above_baselines: if methods[k].baseline { None } else { baseline.map(|f| mean > f) },
             })
         };
         rows.push(Row {
@@ -138,7 +138,7 @@ fn shift_table(
         };
         let name = format!("total/{shift}/{}", method.id);
         totals.push(total(&name, lists(&|_| true))?);
-        let paper_method = paper::counterpart(&method.variant).filter(|_| method.plain);
+        let paper_method = paper::counterpart(&method.base).filter(|_| method.plain);
         let Some((paper_method, column)) = paper_method.and_then(|p| Some((p, paper?.column(p)?))) else { continue };
         let printed = |k: usize| rows[k].paper[column];
         let ours = total(&format!("against/{name}"), lists(&|k| printed(k).is_some()))?;

@@ -8,7 +8,7 @@ use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improv
 use crate::study::Study;
 
 /// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method has, the method with the fewest
-/// tasks is left out, one after the other, a floor last of all: a beginning of one method must not take the others' results away.
+/// tasks is left out, one after the other, a baseline last of all: a beginning of one method must not take the others' results away.
 pub(super) fn compare(
     study: &Study,
     bootstrap: &Bootstrap,
@@ -23,7 +23,7 @@ pub(super) fn compare(
         |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
     let most = kept.iter().map(|m| count(*m)).max().unwrap_or(0);
     while 2 * shared(&kept).len() < most.max(1) {
-        let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].floor, std::cmp::Reverse(**m)))
+        let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].baseline, std::cmp::Reverse(**m)))
         else {
             return Ok(None);
         };
@@ -37,13 +37,13 @@ pub(super) fn compare(
     let places = shared(&kept);
     let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());
     let tables = kept.iter().map(|&m| of(m)).collect::<Result<Vec<_>, _>>()?;
-    let floors: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].floor).collect();
+    let baselines: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].baseline).collect();
     let table_of = |m: usize| &tables[kept.iter().position(|k| *k == m).expect("it is kept")];
     let thresholds = thresholds(&tables);
     // Profiles have a value for every threshold: a fifth of the resamples keeps them as fast as the rest.
     let coarse = Bootstrap { resamples: (bootstrap.resamples / 5).max(1), ..*bootstrap };
-    let best_floor = (0..floors.len()).max_by(|a, b| {
-        let iqm = |k: &usize| table_of(floors[*k]).iqm();
+    let best_baseline = (0..baselines.len()).max_by(|a, b| {
+        let iqm = |k: &usize| table_of(baselines[*k]).iqm();
         iqm(a).total_cmp(&iqm(b))
     });
     let mut methods = Vec::new();
@@ -61,15 +61,15 @@ pub(super) fn compare(
             let pair = [scores, table_of(*f)];
             Ok(bootstrap.intervals(&name, Draw::Runs, &pair, |s| vec![probability_of_improvement(s[0], s[1])])?[0])
         };
-        let over_floors = match method.floor {
+        let over_baselines = match method.baseline {
             true => None,
-            false => Some(floors.iter().map(improvements).collect::<Result<Vec<_>>>()?),
+            false => Some(baselines.iter().map(improvements).collect::<Result<Vec<_>>>()?),
         };
-        let p_value = match best_floor {
-            Some(k) if !method.floor => {
-                let floor = floors[k];
-                let name = format!("{}/{}", method.id, study.methods[floor].id);
-                Some(permutation_p(bootstrap.streams, &name, bootstrap.resamples, scores, table_of(floor))?)
+        let p_value = match best_baseline {
+            Some(k) if !method.baseline => {
+                let baseline = baselines[k];
+                let name = format!("{}/{}", method.id, study.methods[baseline].id);
+                Some(permutation_p(bootstrap.streams, &name, bootstrap.resamples, scores, table_of(baseline))?)
             }
             _ => None,
         };
@@ -81,12 +81,12 @@ pub(super) fn compare(
             over_tasks: [both[0], both[1], both[2], both[3]],
             total: runs[4],
             profile,
-            over_floors,
+            over_baselines,
             p_value,
         });
     }
     let tasks = places.iter().map(|&t| tasks[t]).collect();
-    Ok(Some(Comparison { tasks, methods, left_out, floors, best_floor, level: bootstrap.level, thresholds }))
+    Ok(Some(Comparison { tasks, methods, left_out, baselines, best_baseline, level: bootstrap.level, thresholds }))
 }
 
 /// Every second point from below the lowest score to above the highest, 0 and 100 included.

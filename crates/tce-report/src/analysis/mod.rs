@@ -58,8 +58,8 @@ pub struct Cell {
     pub diverged: usize,
     /// Whether no other method of ours has a higher mean.
     pub best: bool,
-    /// Whether the mean is above that of every floor of this task; None for floors and where there are none.
-    pub above_floors: Option<bool>,
+    /// Whether the mean is above that of every baseline of this task; None for baselines and where there are none.
+    pub above_baselines: Option<bool>,
 }
 
 /// A sum over tasks.
@@ -134,9 +134,9 @@ pub struct Aggregate {
     /// Share of runs above every threshold of the comparison.
     #[serde(skip)]
     pub profile: Vec<Estimate>,
-    /// Probability that a run of it scores higher than a run of each floor of the comparison; None for floors.
-    pub over_floors: Option<Vec<Estimate>>,
-    /// How likely a difference as large as that to the best floor is by chance alone (permutation test); None for floors.
+    /// Probability that a run of it scores higher than a run of each baseline of the comparison; None for baselines.
+    pub over_baselines: Option<Vec<Estimate>>,
+    /// How likely a difference as large as that to the best baseline is by chance alone (permutation test); None for baselines.
     pub p_value: Option<f64>,
 }
 
@@ -149,10 +149,10 @@ pub struct Comparison {
     pub methods: Vec<Aggregate>,
     /// Methods that lack too many tasks, by place.
     pub left_out: Vec<usize>,
-    /// Floors in it, by place among the methods.
-    pub floors: Vec<usize>,
-    /// The floor with the highest interquartile mean, by place in `floors`.
-    pub best_floor: Option<usize>,
+    /// Baselines in it, by place among the methods.
+    pub baselines: Vec<usize>,
+    /// The baseline with the highest interquartile mean, by place in `baselines`.
+    pub best_baseline: Option<usize>,
     /// The intervals' coverage.
     pub level: f64,
     /// Where the performance profiles are computed.
@@ -160,7 +160,7 @@ pub struct Comparison {
     pub thresholds: Vec<f64>,
 }
 
-/// What can be said of a method against the best floor.
+/// What can be said of a method against the best baseline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Finding {
@@ -240,9 +240,9 @@ pub fn score(run: &Run) -> Option<f64> {
 }
 
 impl Comparison {
-    /// Probability that a run of `aggregate` scores higher than one of the best floor, and what that means.
+    /// Probability that a run of `aggregate` scores higher than one of the best baseline, and what that means.
     pub fn improvement(&self, aggregate: &Aggregate) -> Option<(Estimate, Finding)> {
-        let estimate = aggregate.over_floors.as_ref()?[self.best_floor?];
+        let estimate = aggregate.over_baselines.as_ref()?[self.best_baseline?];
         let chance = aggregate.p_value.is_none_or(|p| p > 1.0 - self.level);
         let finding = match estimate.interval {
             None => Finding::Unknown,
@@ -254,19 +254,19 @@ impl Comparison {
         Some((estimate, finding))
     }
 
-    /// The best floor's place among the methods.
-    pub fn best_floor(&self) -> Option<usize> {
-        self.best_floor.map(|k| self.floors[k])
+    /// The best baseline's place among the methods.
+    pub fn best_baseline(&self) -> Option<usize> {
+        self.best_baseline.map(|k| self.baselines[k])
     }
 
-    /// The best floor's figures.
+    /// The best baseline's figures.
     pub fn standard(&self) -> Option<&Aggregate> {
-        self.best_floor().and_then(|m| self.methods.iter().find(|a| a.method == m))
+        self.best_baseline().and_then(|m| self.methods.iter().find(|a| a.method == m))
     }
 
-    /// Points by which the interquartile mean of `aggregate` is above that of the best floor; None for floors.
+    /// Points by which the interquartile mean of `aggregate` is above that of the best baseline; None for baselines.
     pub fn gap(&self, aggregate: &Aggregate) -> Option<f64> {
-        aggregate.over_floors.as_ref()?;
+        aggregate.over_baselines.as_ref()?;
         Some(aggregate.over_seeds[0].point - self.standard()?.over_seeds[0].point)
     }
 }

@@ -12,9 +12,9 @@ fn words(n: usize) -> String {
     WORDS.get(n).map_or_else(|| n.to_string(), |w| (*w).to_owned())
 }
 
-/// `two seeds`, `1 to 3 seeds`: of the method and the floor, whichever has fewer or more.
-fn seeds(a: &Aggregate, floor: &Aggregate) -> String {
-    match (a.seeds.0.min(floor.seeds.0), a.seeds.1.max(floor.seeds.1)) {
+/// `two seeds`, `1 to 3 seeds`: of the method and the baseline, whichever has fewer or more.
+fn seeds(a: &Aggregate, baseline: &Aggregate) -> String {
+    match (a.seeds.0.min(baseline.seeds.0), a.seeds.1.max(baseline.seeds.1)) {
         (1, 1) => "one seed".into(),
         (least, most) if least == most => format!("{} seeds", words(least)),
         (least, most) => format!("{least} to {most} seeds"),
@@ -32,7 +32,7 @@ pub fn gap_words(gap: f64) -> String {
     }
 }
 
-/// Whether that gap is more than chance, as the end of a sentence: `two seeds cannot prove it`. None for floors.
+/// Whether that gap is more than chance, as the end of a sentence: `two seeds cannot prove it`. None for baselines.
 pub fn verdict_words(c: &Comparison, a: &Aggregate) -> Option<String> {
     let (estimate, finding) = c.improvement(a)?;
     let (gap, seeds) = (c.gap(a)?, seeds(a, c.standard()?));
@@ -56,24 +56,24 @@ pub fn verdict_words(c: &Comparison, a: &Aggregate) -> Option<String> {
     })
 }
 
-/// One method against the best floor.
+/// One method against the best baseline.
 fn against(analysis: &Analysis, c: &Comparison, a: &Aggregate) -> Option<String> {
-    let floor = c.standard()?;
+    let baseline = c.standard()?;
     let title = |m: usize| analysis.methods[m].title.as_str();
-    let (own, other) = (a.over_seeds[0].point, floor.over_seeds[0].point);
+    let (own, other) = (a.over_seeds[0].point, baseline.over_seeds[0].point);
     Some(format!(
         "{} is {} the best baseline, {} ({own:.1} against {other:.1}); {}.",
         title(a.method),
         gap_words(c.gap(a)?),
-        title(floor.method),
+        title(baseline.method),
         verdict_words(c, a)?,
     ))
 }
 
 /// How many methods are what, where there are several.
-fn counts(analysis: &Analysis, c: &Comparison, judged: &[(&Aggregate, Finding)]) -> String {
+fn counts(analysis: &Analysis, c: &Comparison, compared: &[(&Aggregate, Finding)]) -> String {
     let named = |of: &dyn Fn(Finding) -> bool| -> Vec<&str> {
-        judged.iter().filter(|j| of(j.1)).map(|j| analysis.methods[j.0.method].title.as_str()).collect()
+        compared.iter().filter(|j| of(j.1)).map(|j| analysis.methods[j.0.method].title.as_str()).collect()
     };
     let part = |names: Vec<&str>, one: &str, many: &str| match names.len() {
         0 => None,
@@ -91,12 +91,12 @@ fn counts(analysis: &Analysis, c: &Comparison, judged: &[(&Aggregate, Finding)])
     .into_iter()
     .flatten()
     .collect();
-    let floor = c.standard().map_or("", |f| analysis.methods[f.method].title.as_str());
+    let baseline = c.standard().map_or("", |f| analysis.methods[f.method].title.as_str());
     let parts = match &parts[..] {
         [rest @ .., last] if !rest.is_empty() => format!("{}, and {last}", rest.join(", ")),
         _ => parts.join(""),
     };
-    format!("Of {} methods compared with {floor}, {parts}.", words(judged.len()))
+    format!("Of {} methods compared with {baseline}, {parts}.", words(compared.len()))
 }
 
 /// What the recommended policies came to.
@@ -139,25 +139,25 @@ fn recommended(all: &[Recommendation]) -> Option<String> {
 pub fn opening(analysis: &Analysis) -> Vec<String> {
     let first = |text: &str| vec![text.to_owned()];
     let Some(c) = &analysis.comparison else { return first("No run has a score.") };
-    let Some(floor) = c.standard() else {
+    let Some(baseline) = c.standard() else {
         return first("There is no baseline to compare with: without one a score says little.");
     };
-    let mut judged: Vec<(&Aggregate, Finding)> =
+    let mut compared: Vec<(&Aggregate, Finding)> =
         c.methods.iter().filter_map(|a| Some((a, c.improvement(a)?.1))).collect();
-    judged.sort_by(|a, b| b.0.over_seeds[0].point.total_cmp(&a.0.over_seeds[0].point));
-    let mut out = match &judged[..] {
-        [] if analysis.methods.iter().all(|m| m.floor) => {
-            let score = floor.over_seeds[0].point;
+    compared.sort_by(|a, b| b.0.over_seeds[0].point.total_cmp(&a.0.over_seeds[0].point));
+    let mut out = match &compared[..] {
+        [] if analysis.methods.iter().all(|m| m.baseline) => {
+            let score = baseline.over_seeds[0].point;
             vec![format!(
                 "Only baselines were run. The best of them is {}: {score:.1}.",
-                analysis.methods[floor.method].title
+                analysis.methods[baseline.method].title
             )]
         }
         [] => first("No method can be compared with the baselines: they share no task with scores."),
         [(only, _)] => against(analysis, c, only).into_iter().collect(),
         [(highest, _), ..] => {
             let mut text: Vec<String> = against(analysis, c, highest).into_iter().collect();
-            text.push(counts(analysis, c, &judged));
+            text.push(counts(analysis, c, &compared));
             text
         }
     };

@@ -98,7 +98,7 @@ pub fn doubt(study: &Study, shift: Shift) -> Option<String> {
     paper::table(shift)?;
     // Methods that differ in the same way share a sentence.
     let mut parts: Vec<(String, Vec<&str>)> = Vec::new();
-    for method in study.methods.iter().filter(|m| paper::counterpart(&m.variant).is_some()) {
+    for method in study.methods.iter().filter(|m| paper::counterpart(&m.base).is_some()) {
         let runs: Vec<&Run> = study.runs.iter().filter(|r| r.task.shift == shift && r.method == method.id).collect();
         let mut by_task: BTreeMap<_, usize> = BTreeMap::new();
         runs.iter().for_each(|r| *by_task.entry(r.task.to_string()).or_default() += 1);

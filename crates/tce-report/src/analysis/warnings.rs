@@ -137,12 +137,12 @@ fn of_methods(study: &Study, tasks: &[Task], scores: &[Vec<Vec<f64>>], published
             );
         }
     }
-    // Without `--no-floors` all four are there: a table without them is a choice that a reader has to know.
+    // Without `--no-baselines` all four are there: a table without them is a choice that a reader has to know.
     let bare: BTreeMap<&str, usize> = study
         .methods
         .iter()
         .enumerate()
-        .filter(|(_, method)| method.floor)
+        .filter(|(_, method)| method.baseline)
         .map(|(m, method)| (method.title.as_str(), scores.iter().filter(|t| t[m].is_empty()).count()))
         .filter(|(_, missing)| *missing > 0)
         .collect();
@@ -192,16 +192,20 @@ fn of_comparison(study: &Study, tasks: &[Task], c: &Comparison, out: &mut Vec<Wa
         };
         c.methods.iter().filter(is).map(|a| format!("{} ({})", title(a.method), gap(a))).collect()
     };
-    if let Some(floor) = c.best_floor() {
+    if let Some(baseline) = c.best_baseline() {
         let worse = finding(Finding::Worse);
         let open = [Finding::Open, Finding::Few, Finding::Unknown].map(finding).concat();
         if !worse.is_empty() {
             let names = list(worse.iter().map(String::as_str));
-            warn(out, format!("Shown to fall short of the best baseline, {}: {names}.", title(floor)), Vec::new());
+            warn(out, format!("Shown to fall short of the best baseline, {}: {names}.", title(baseline)), Vec::new());
         }
         if !open.is_empty() {
             let names = list(open.iter().map(String::as_str));
-            warn(out, format!("Not proved to differ from the best baseline, {}: {names}.", title(floor)), Vec::new());
+            warn(
+                out,
+                format!("Not proved to differ from the best baseline, {}: {names}.", title(baseline)),
+                Vec::new(),
+            );
         }
     }
 }

@@ -34,10 +34,10 @@ pub(super) fn implied(i: &Implied) -> Markup {
 }
 
 /// A row of the table: what it is, what was found, and what would be good.
-type Judged = (String, String, String);
+type Assessed = (String, String, String);
 
 /// Shares and errors, each beside what would be good.
-fn judged(d: &Diagnosis) -> Vec<Judged> {
+fn assessed(d: &Diagnosis) -> Vec<Assessed> {
     let mut rows = coverage(d);
     let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
     if let Some(m) = d.at_own_bound().and_then(|b| b.memorisation) {
@@ -83,8 +83,8 @@ fn judged(d: &Diagnosis) -> Vec<Judged> {
 }
 
 /// How much of both domains generated rows reach.
-fn coverage(d: &Diagnosis) -> Vec<Judged> {
-    let mut rows: Vec<Judged> = Vec::new();
+fn coverage(d: &Diagnosis) -> Vec<Assessed> {
+    let mut rows: Vec<Assessed> = Vec::new();
     let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
     let second = if d.covered_by_fresh { "other target episodes" } else { "the same target episodes" };
     let mut bounds = vec![d.y_max];
@@ -113,8 +113,8 @@ fn coverage(d: &Diagnosis) -> Vec<Judged> {
 }
 
 /// Errors of the label models.
-fn labels(d: &Diagnosis) -> Vec<Judged> {
-    let mut rows: Vec<Judged> = Vec::new();
+fn labels(d: &Diagnosis) -> Vec<Assessed> {
+    let mut rows: Vec<Assessed> = Vec::new();
     let mut row = |what: &str, here: String, good: String| rows.push((what.to_owned(), here, good));
     let l = &d.labels;
     for (what, value) in [("action", l.held_out_action), ("reward", l.held_out_reward)] {
@@ -146,14 +146,14 @@ fn labels(d: &Diagnosis) -> Vec<Judged> {
     rows
 }
 
-/// [`judged`] as a table.
+/// [`assessed`] as a table.
 pub(super) fn figures_and_good(d: &Diagnosis) -> Markup {
     html! {
         div class="scroll" {
-            table class="judged" {
+            table class="assessed" {
                 thead { tr { th class="first" { "Figure" } th { "Here" } th class="text" { "Good" } } }
                 tbody {
-                    @for (what, here, good) in judged(d) {
+                    @for (what, here, good) in assessed(d) {
                         tr { th scope="row" { (what) } td { (here) } td class="text" { (good) } }
                     }
                 }
@@ -188,7 +188,7 @@ pub(super) fn bounds_table(d: &Diagnosis, b: &Bounds) -> Markup {
     rows.extend(d.choice_by_simulator.as_ref().map(|c| ("λ of the rule where the simulator measures", c.to_string())));
     html! {
         div class="scroll" {
-            table class="judged" {
+            table class="assessed" {
                 thead { tr { th class="first" { "|ΔV|: difference of the values of two next states" } th { "Figure" } } }
                 tbody { @for (name, value) in &rows { tr { th scope="row" { (name) } td { (value) } } } }
             }

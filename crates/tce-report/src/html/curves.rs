@@ -93,7 +93,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
             (panels(&scores, "normalised score", false))
         } @else {
             p class="note" {
-                "These runs were judged at the end only. Scores on the way come with "
+                "These runs were evaluated at the end only. Scores on the way come with "
                 code { "--set evaluation.every=STEPS" } "."
             }
         }

@@ -1,4 +1,4 @@
-//! The findings: every method beside the best floor.
+//! The findings: every method beside the best baseline.
 
 use maud::{Markup, html};
 use tce_data::Shift;
@@ -29,7 +29,7 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
     };
     let title = |m: usize| analysis.methods[m].title.as_str();
     let percent = (100.0 * analysis.level).round();
-    let floor = c.standard();
+    let baseline = c.standard();
     let sentence = |a: &Aggregate| -> Option<String> {
         let (p, _) = c.improvement(a)?;
         Some(format!(
@@ -46,7 +46,7 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
         p {
             "Compared on " (counted(c.tasks.len(), "task", "tasks")) ", on which " (counted(c.methods.len(), "method", "methods"))
             " have scores. "
-            @if let Some(f) = floor {
+            @if let Some(f) = baseline {
                 "The best " (term("baseline", "baseline")) " is " (title(f.method)) ", with an " (term("iqm", "interquartile mean"))
                 " of " (said(&f.over_seeds[0], 1)) ". "
             }
@@ -59,7 +59,7 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
                     tr class="groups" {
                         th class="first" {}
                         th colspan="2" {}
-                        @if let Some(f) = floor {
+                        @if let Some(f) = baseline {
                             th class="edge" colspan="4" { "Against the best baseline, " (title(f.method)) }
                         }
                         th class="edge" colspan="2" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
@@ -67,30 +67,30 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
                     tr {
                         th class="first" { "Method" }
                         th { "Runs" } th { (term("iqm", "Interquartile mean")) }
-                        @if floor.is_some() {
+                        @if baseline.is_some() {
                             th class="edge" { "Points above it" } th { (term("improvement", "Share of pairs higher")) } th { (term("p", "p")) }
                             th class="text" { "Finding" }
                         }
                         th class="edge" { "Mean" } th { "Total" }
                     }
                 }
-                tbody { @for a in &c.methods { (row(analysis, c, floor, a)) } }
+                tbody { @for a in &c.methods { (row(analysis, c, baseline, a)) } }
             }
         }
-        (other_floors(analysis, c))
+        (other_baselines(analysis, c))
         (recommendations(analysis))
         (components(study, analysis, c))
     }
 }
 
 /// A method's line.
-fn row(analysis: &Analysis, c: &Comparison, floor: Option<&Aggregate>, a: &Aggregate) -> Markup {
+fn row(analysis: &Analysis, c: &Comparison, baseline: Option<&Aggregate>, a: &Aggregate) -> Markup {
     html! {
         tr {
             th scope="row" { (title_cell(analysis, a.method)) }
             td { (a.runs) }
             td { (estimate(&a.over_seeds[0], 1)) }
-            @match (floor, c.improvement(a)) {
+            @match (baseline, c.improvement(a)) {
                 (None, _) => {}
                 (_, Some((e, finding))) => {
                     td class="edge" { (c.gap(a).map_or("–".into(), signed)) }
@@ -115,21 +115,21 @@ fn row(analysis: &Analysis, c: &Comparison, floor: Option<&Aggregate>, a: &Aggre
 }
 
 /// Methods beside the baselines that are not the best.
-fn other_floors(analysis: &Analysis, c: &Comparison) -> Markup {
-    let others: Vec<usize> = (0..c.floors.len()).filter(|k| Some(*k) != c.best_floor).collect();
-    let judged: Vec<(&Aggregate, &Vec<_>)> =
-        c.methods.iter().filter_map(|a| Some((a, a.over_floors.as_ref()?))).collect();
+fn other_baselines(analysis: &Analysis, c: &Comparison) -> Markup {
+    let others: Vec<usize> = (0..c.baselines.len()).filter(|k| Some(*k) != c.best_baseline).collect();
+    let compared: Vec<(&Aggregate, &Vec<_>)> =
+        c.methods.iter().filter_map(|a| Some((a, a.over_baselines.as_ref()?))).collect();
     html! {
-        @if !others.is_empty() && !judged.is_empty() {
+        @if !others.is_empty() && !compared.is_empty() {
             h3 { "Share of pairs in which a method's run scores higher than another baseline's" }
             div class="scroll" {
                 table {
                     thead { tr {
                         th class="first" { "Method" }
-                        @for k in &others { th { (analysis.methods[c.floors[*k]].title) } }
+                        @for k in &others { th { (analysis.methods[c.baselines[*k]].title) } }
                     } }
                     tbody {
-                        @for (a, over) in &judged {
+                        @for (a, over) in &compared {
                             tr { th scope="row" { (title_cell(analysis, a.method)) } @for k in &others { td { (estimate(&over[*k], 2)) } } }
                         }
                     }
@@ -175,7 +175,7 @@ fn components(study: &Study, analysis: &Analysis, c: &Comparison) -> Markup {
         .iter()
         .filter(|a| whole && study.methods[a.method].plain)
         .filter_map(|a| {
-            let name = paper::counterpart(&study.methods[a.method].variant)?;
+            let name = paper::counterpart(&study.methods[a.method].base)?;
             Some((a, paper::components().iter().find(|p| p.0 == name)?))
         })
         .collect();

@@ -13,7 +13,7 @@ pub(super) fn methods(analysis: &Analysis) -> Markup {
              settings name (" code { "evaluation.scores" } ")."
         }
         p {
-            b { "Baselines (floors). " }
+            b { "Baselines. " }
             "Cloning of the target rows with raw and with standardised observations, cloning of the best half of the trajectories, and \
              implicit Q-learning (IQL) on the target rows alone. The best baseline is the one with the highest interquartile mean on the \
              compared tasks. It is chosen by its scores, which favours the baselines."

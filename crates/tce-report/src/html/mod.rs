@@ -60,7 +60,7 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
     let tasks: BTreeSet<String> =
         analysis.tables.iter().flat_map(|t| t.rows.iter().map(|r| r.task.to_string())).collect();
     let seeds: BTreeSet<u64> = study.runs.iter().map(|r| r.member.seed).collect();
-    let floors = analysis.methods.iter().filter(|m| m.floor).count();
+    let baselines = analysis.methods.iter().filter(|m| m.baseline).count();
     let all = study.runs.len() + study.missing.len();
     let hours = study.runs.iter().map(|r| r.folder.seconds / r.folder.members.len() as f64).sum::<f64>();
     let shifts: Vec<String> = analysis.tables.iter().map(|t| shift_title(t.shift).to_lowercase()).collect();
@@ -76,7 +76,7 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
                 p class="note" {
                     "Points are of the " (term("score", "normalised score")) ": a random policy has 0, an expert of the target robot 100. A "
                     (term("baseline", "baseline")) " is a simple method that a result has to beat"
-                    @if analysis.methods.iter().any(|m| m.floor && m.title.starts_with("BC")) {
+                    @if analysis.methods.iter().any(|m| m.baseline && m.title.starts_with("BC")) {
                         "; BC is " (term("bc", "behaviour cloning"))
                     }
                     ". Methods are compared by their "
@@ -92,7 +92,7 @@ fn head(study: &Study, analysis: &Analysis) -> Markup {
                 li { b { (analysis.recipes.names()) } (term("preset", if presets == 1 { "preset" } else { "presets" })) }
                 @if let Some(updates) = analysis.recipes.updates() { li { b { (updates) } (term("updates", "learner updates")) } }
                 li { b { (tasks.len()) } (if tasks.len() == 1 { "task" } else { "tasks" }) }
-                li { b { (analysis.methods.len() - floors) " + " (floors) } "methods + baselines" }
+                li { b { (analysis.methods.len() - baselines) " + " (baselines) } "methods + baselines" }
                 li { b { (seeds.len()) } (if seeds.len() == 1 { "seed" } else { "seeds" }) }
                 li { b { (study.runs.len()) " / " (all) } "runs with a result" }
                 li { b { (duration(hours)) } "run time in all" }

@@ -60,11 +60,11 @@ pub(crate) fn counted(n: usize, one: &str, many: &str) -> String {
     if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
 }
 
-/// Colour and dashes of every method: floors are grey.
+/// Colour and dashes of every method: baselines are grey.
 pub(crate) fn classes(analysis: &Analysis) -> Vec<Series> {
-    let (mut floors, mut others) = (0, 0);
+    let (mut baselines, mut others) = (0, 0);
     let class = |m: &crate::study::Method| {
-        let (count, letter, hues) = if m.floor { (&mut floors, 'f', 5) } else { (&mut others, 'm', 8) };
+        let (count, letter, hues) = if m.baseline { (&mut baselines, 'f', 5) } else { (&mut others, 'm', 8) };
         let k = *count;
         *count += 1;
         let again = if k >= hues { " again" } else { "" };

@@ -14,7 +14,7 @@ fn cell(cell: Option<&Cell>, class: &str) -> Markup {
     if c.best {
         class += " best";
     }
-    if c.above_floors == Some(true) {
+    if c.above_baselines == Some(true) {
         class += " above";
     }
     let seeds = counted(c.seeds, "seed", "seeds");
@@ -129,14 +129,14 @@ fn groups(analysis: &Analysis, t: &ShiftTable) -> ([(&'static str, Vec<Column>);
     // The paper's figures for a method stand right beside ours, the rest of the paper behind them.
     let mut beside: Vec<Column> = Vec::new();
     let mut used: BTreeSet<usize> = BTreeSet::new();
-    for m in (0..methods.len()).filter(|m| !methods[*m].floor) {
+    for m in (0..methods.len()).filter(|m| !methods[*m].baseline) {
         beside.push(Column::Ours(m));
         let name = t.against.iter().find(|a| a.method == m).map(|a| a.paper_method.as_str());
         let column = name.and_then(|name| t.paper?.column(name)).filter(|c| used.insert(*c));
         beside.extend(column.map(Column::Paper));
     }
     let groups = [
-        ("Baselines", (0..methods.len()).filter(|m| methods[*m].floor).map(Column::Ours).collect()),
+        ("Baselines", (0..methods.len()).filter(|m| methods[*m].baseline).map(Column::Ours).collect()),
         (if used.is_empty() { "Methods" } else { "Methods, ours and the paper's" }, beside),
         ("Others in the paper", (0..papers.len()).filter(|c| !used.contains(c)).map(Column::Paper).collect()),
     ];

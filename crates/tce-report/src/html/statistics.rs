@@ -72,9 +72,9 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
                 }, &profile))
                 div class="keys" { @for l in &profile { (svg::key(&l.series)) } }
             }
-            @if let (Some(floor), false) = (c.best_floor(), better.is_empty()) {
+            @if let (Some(baseline), false) = (c.best_baseline(), better.is_empty()) {
                 figure {
-                    figcaption { "Probability of improvement on the best baseline " span { (analysis.methods[floor].title) } }
+                    figcaption { "Probability of improvement on the best baseline " span { (analysis.methods[baseline].title) } }
                     (svg::intervals("Probability of improvement", &better,
                         &Axis::fixed(0.0, 1.0, &[0.0, 0.25, 0.5, 0.75, 1.0]),
                         "share of pairs in which the method is higher", Some(0.5), 2))

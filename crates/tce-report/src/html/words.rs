@@ -37,9 +37,9 @@ static WORDS: &[Word] = &[
     ),
     word(
         "baseline",
-        "Baseline, floor",
+        "Baseline",
         "A simple method that a result has to beat to be worth its effort: cloning the target rows (BC), and implicit \
-         Q-learning (IQL) on the target rows alone. The program calls baselines floors. The best one is that with the highest \
+         Q-learning (IQL) on the target rows alone. The best one is that with the highest \
          interquartile mean on the compared tasks.",
     ),
     word("bc", "BC", "Behaviour cloning: a network is trained to repeat the actions of the data."),

@@ -59,8 +59,20 @@ pub fn write_folder(directory: &Path, scores: &[(u64, Option<f64>)], config: &st
     write("metrics.jsonl", &(lines + "{\"stage\":\"le"));
 }
 
-pub fn method(id: &str, title: &str, floor: bool) -> Method {
-    Method { id: id.into(), title: title.into(), variant: id.into(), floor, plain: true }
+pub fn method(id: &str, title: &str, baseline: bool) -> Method {
+    let (base, published) = match id.strip_suffix("-published") {
+        Some(base) => (base, true),
+        None => (id, false),
+    };
+    Method {
+        id: id.into(),
+        title: title.into(),
+        variant: id.into(),
+        base: base.into(),
+        published,
+        baseline,
+        plain: true,
+    }
 }
 
 pub fn add(study: &mut Study, task: Task, method: &str, directory: &Path) {
@@ -83,7 +95,7 @@ pub fn quick() -> Options {
     Options { resamples: 200, ..Options::default() }
 }
 
-/// One task: of every method its id, its title and a score per seed. Ids that begin with `bc` are floors.
+/// One task: of every method its id, its title and a score per seed. Ids that begin with `bc` are baselines.
 pub fn one_task(root: &Path, methods: &[(&str, &str, &[f64])]) -> Study {
     let mut study = Study {
         name: "demo".into(),

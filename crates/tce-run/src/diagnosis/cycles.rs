@@ -1,7 +1,7 @@
 //! The network at the end of every cycle of q_tran (`generator.transition_steps = "auto"`), one row each: how long q_tran has to be
 //! trained until what it implies is sharp.
 //!
-//! Held-out losses and consistency flatten out, or rise, long before the implied action is as good as it gets; the figures stand side
+//! Held-out losses and consistency flatten out, or rise, long before the implied action is as good as it gets; the metrics stand side
 //! by side here. (Walker2d, 22.5k to 112.5k updates: the held-out loss rises by a third, the implied action's error at held-out rows falls
 //! by two fifths, the score rises from 16 to 84.)
 
@@ -23,10 +23,10 @@ use tce_zoo::actors::Arena;
 use super::generator::{Consistency, consistency, step_std};
 use super::implied::{DRAWS, ImpliedActor, implied_actions, rollout_implied};
 use super::measures::pairs;
+use crate::augment::label_models;
+use crate::augment::networks;
 use crate::config::Config;
 use crate::error::Result;
-use crate::expand::label_models;
-use crate::expand::networks;
 use crate::inputs::Inputs;
 use crate::kept::cycle_file;
 use crate::stage::Stage;
@@ -90,7 +90,7 @@ impl Bench<'_> {
         let successors = generator.sample_successors(&self.states, &Draw::new(&sampler, &members, self.target))?;
         let pair = (units.put_back(&self.states), units.put_back(&successors));
         let rows = self.models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-        let judged = self.held_out.as_ref().map(|h| h.judge(&pairs(units, &rows), &self.streams)).transpose()?;
+        let comparison = self.held_out.as_ref().map(|h| h.compare(&pairs(units, &rows), &self.streams)).transpose()?;
         let actor = ImpliedActor::new(generator, self.models, 0, sampler, self.target, self.device);
         let streams = self.streams.child("implied");
         let split = (&self.split.0[..], &self.split.1[..]);
@@ -104,7 +104,7 @@ impl Bench<'_> {
             consistency: consistency(self.place.0, self.place.1, &rows, &self.step, &units.live)?,
             actions: implied_actions(&actor, self.target, split, DRAWS, &streams)?,
             rollout: (self.episodes > 0).then(rollout).transpose()?,
-            nearer: judged.flatten().map(|m| m.probability),
+            nearer: comparison.flatten().map(|m| m.probability),
         })
     }
 }
@@ -121,7 +121,7 @@ pub struct Asked {
     pub place: (Agent, Shift),
     /// Of the training.
     pub seed: u64,
-    /// Generated rows behind a figure.
+    /// Generated rows behind a metric.
     pub rows: usize,
     /// Episodes of the implied policy.
     pub episodes: usize,
@@ -161,9 +161,9 @@ pub fn cycles(
         device,
         step: step.clone(),
     };
-    let figure = |name: &str| recorded(&stage.file("metrics.jsonl"), "transition", 0, name);
+    let metric = |name: &str| recorded(&stage.file("metrics.jsonl"), "transition", 0, name);
     let (training, held_out): (BTreeMap<u64, f64>, BTreeMap<u64, f64>) =
-        (figure("training_loss")?, figure("held_out_loss")?);
+        (metric("training_loss")?, metric("held_out_loss")?);
     let mut networks = Vec::new();
     let chosen = generator.transition.clone();
     for end in &trained.transition_curve {
@@ -203,8 +203,8 @@ pub fn cycles(
 impl AtCycle {
     /// The cells of a table, as [`AtCycle::HEADER`] names them.
     pub fn cells(&self) -> [String; 12] {
-        let figure = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
-        let of = |e: Option<ImpliedErrors>, f: fn(&ImpliedErrors) -> f64| figure(e.as_ref().map(f));
+        let metric = |v: Option<f64>| v.map_or("-".into(), |v| format!("{v:.4}"));
+        let of = |e: Option<ImpliedErrors>, f: fn(&ImpliedErrors) -> f64| metric(e.as_ref().map(f));
         let (trained, held_out) = (self.actions.trained, self.actions.held_out);
         let updates = self.updates.map_or("?".into(), |u| u.to_string());
         let score = match &self.rollout {
@@ -217,8 +217,8 @@ impl AtCycle {
         };
         [
             if self.chosen { format!("{updates} (chosen)") } else { updates },
-            figure(self.held_out_loss),
-            figure(self.training_loss),
+            metric(self.held_out_loss),
+            metric(self.training_loss),
             format!("{:.3} / {:.3}", self.consistency.median, self.consistency.p90),
             of(trained, |e| e.single),
             of(held_out, |e| e.single),

@@ -1,6 +1,6 @@
 //! What the generator gets right and wrong, measured against held-out target rows and the simulator.
 //!
-//! | figure | meaning |
+//! | metric | meaning |
 //! |---|---|
 //! | SW | sliced Wasserstein-1 distance of standardised states at ŷ = 0 to training and to held-out target states |
 //! | std ratio | mean over dimensions of std(generated) / std(training) at ŷ = 0 |
@@ -143,9 +143,9 @@ impl Tried<'_> {
         let step = step_std(training, &units.live);
         let pair = (units.put_back(&states), units.put_back(&successors));
         let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-        let expanded_states = generator.sample_states(rows, config.y_max, &draw)?;
-        let expanded_successors = generator.sample_successors(&expanded_states, &draw)?;
-        let expanded = finisher.finish(&[(&expanded_states, &expanded_successors)])?.remove(0).transitions;
+        let wider_states = generator.sample_states(rows, config.y_max, &draw)?;
+        let wider_successors = generator.sample_successors(&wider_states, &draw)?;
+        let expanded = finisher.finish(&[(&wider_states, &wider_successors)])?.remove(0).transitions;
         Ok(Quality {
             evaluations: sampler.evaluations(),
             sw_training: sw(&training_states),

@@ -1,8 +1,8 @@
 //! The policy that the generator implies, a = Inv(s, ŝ') with ŝ' ~ q_tran(· | s): its actions at real target states, and what it
-//! gets when it is rolled out. What the figures mean is told in [`tce_diagnosis::implied`].
+//! gets when it is rolled out. What the metrics mean is told in [`tce_diagnosis::implied`].
 //!
 //! The inverse dynamics model has its own held-out rows, drawn one by one: most of those that q_tran has not seen it has. Its own error
-//! at the same rows stands beside the figures.
+//! at the same rows stands beside the metrics.
 
 use rand::RngExt;
 use tce_augment::two_stage::{Draw, Generator};
@@ -149,7 +149,7 @@ pub fn rollout_implied(
 ) -> Result<ImpliedRollout> {
     let results = match tce_sim::evaluate(arena.agent, arena.shift, actor, episodes, streams, interrupted) {
         Ok(results) => results,
-        Err(SimError::NotFinite { .. }) if interrupted() => return Err(Error::Interrupted),
+        Err(SimError::NotFinite { .. }) if interrupted() => return Err(Error::interrupted()),
         Err(e @ SimError::NotFinite { .. }) => {
             let failed = Some(e.to_string());
             return Ok(ImpliedRollout { episodes, score: None, returns: None, length: None, failed });
@@ -175,7 +175,7 @@ mod tests {
     use tce_base::random::fill_uniform;
     use tce_data::{Agent, Shift, Standardizer};
     use tce_diffusion::{
-        Condition, Edm, NetworkConfig, Part, Process, Schedule, ScoreData, Target, TrainConfig, Trainer,
+        Balance, Condition, Edm, NetworkConfig, Part, Process, Schedule, ScoreData, Target, TrainConfig, Trainer,
     };
     use tce_learn::{LabelConfig, Member, train_labels};
     use tce_nn::{Checkpoints, cpu};
@@ -193,7 +193,7 @@ mod tests {
         let outputs =
             units.output.apply(&Target::Delta.encode(&units.take(&t.observations), &units.take(&t.next_observations)));
         let part = Part { rows: &states, condition: Condition::Constant(vec![0.0]) };
-        let state_data = ScoreData::new(vec![part], d, 1, false).unwrap();
+        let state_data = ScoreData::new(vec![part], d, 1, Balance::Rows).unwrap();
         let transition_data = ScoreData::conditioned(&outputs, d, &states, d).unwrap();
         let dir = tempfile::tempdir().unwrap();
         let train = |name: &str, width: usize, data: ScoreData| {
@@ -211,7 +211,7 @@ mod tests {
             reward_scale: 1.0,
             row_scores: None,
         };
-        let labels = LabelConfig { steps, ..LabelConfig::default() };
+        let labels = LabelConfig { steps, ..LabelConfig::paper() };
         let mut kept = Checkpoints::open(dir.path(), "labels", "test").unwrap();
         let models = train_labels(&[member], &labels, &mut kept, &device).unwrap().unwrap();
         (Generator { units, state, transition }, models)

@@ -1,4 +1,4 @@
-//! Every figure of a diagnosis.
+//! Every metric of a diagnosis.
 
 use tce_augment::score_training::held_out_rows;
 use tce_augment::units::Units;
@@ -144,7 +144,7 @@ impl Work<'_> {
         states
     }
 
-    /// The figures under one label bound.
+    /// The metrics under one label bound.
     fn at_bound(
         &self,
         y: f32,
@@ -154,9 +154,9 @@ impl Work<'_> {
         notes: &mut Vec<String>,
     ) -> Result<AtBound> {
         let Measured { models, references, held_out, step, streams } = *measured;
-        let figures = Figures::of(batch, distances, models, step, &self.units().live)?;
+        let metrics = Metrics::of(batch, distances, models, step, &self.units().live)?;
         let kept = batch.kept_rows();
-        let judge = |h: &memorisation::HeldOut| h.judge(&pairs(self.units(), &kept), streams);
+        let compare = |h: &memorisation::HeldOut| h.compare(&pairs(self.units(), &kept), streams);
         let coverage = references.map_or(Ok(None), |r| r.covered_by(&kept, self.units(), streams))?;
         if references.is_some() && coverage.is_none() {
             notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", kept.len()));
@@ -166,9 +166,9 @@ impl Work<'_> {
             lost: batch.lost,
             coverage,
             rejected: batch.rejected(),
-            memorisation: held_out.map(judge).transpose()?.flatten(),
-            kept: figures.reliability(batch, true),
-            outliers: (batch.kept() < batch.len()).then(|| figures.reliability(batch, false)),
+            memorisation: held_out.map(compare).transpose()?.flatten(),
+            kept: metrics.reliability(batch, true),
+            outliers: (batch.kept() < batch.len()).then(|| metrics.reliability(batch, false)),
         })
     }
 
@@ -358,9 +358,9 @@ impl Work<'_> {
     }
 }
 
-/// One number per row of a batch, for every figure that can be measured.
+/// One number per row of a batch, for every metric that can be measured.
 #[derive(Default)]
-struct Figures {
+struct Metrics {
     distance: Vec<f64>,
     transition_kl: Option<Vec<f64>>,
     reward_difference: Option<Vec<f64>>,
@@ -368,7 +368,7 @@ struct Figures {
     consistency: Option<Vec<f64>>,
 }
 
-impl Figures {
+impl Metrics {
     /// `step` is the spread of the target's steps in the dimensions `live`.
     fn of(batch: &Batch, distances: &[f32], models: &Models, step: &[f32], live: &[usize]) -> Result<Self> {
         let t = &batch.rows;

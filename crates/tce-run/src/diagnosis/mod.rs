@@ -4,7 +4,7 @@
 //! |---|---|
 //! | rows over y_max: sampled, filtered, labelled, simulated | `rows.rs` |
 //! | abundant target rows, and the models that are compared | `models.rs` |
-//! | every figure of a diagnosis | `measures.rs` |
+//! | every metric of a diagnosis | `measures.rs` |
 //! | the policy that the generator implies | `implied.rs` |
 //! | the networks at the ends of q_tran's cycles (`tce diagnose generator --cycles`) | `cycles.rs` |
 //! | one sampler beside others (`tce diagnose generator`) | `generator.rs` |
@@ -22,11 +22,11 @@ use tce_data::Task;
 use tce_diagnosis::Diagnosis;
 use tce_nn::Device;
 
+use crate::augment::{finisher, label_models, networks};
 use crate::config::{Config, GeneratedRows};
 use crate::course::Course;
 use crate::error::{Error, Result};
-use crate::expand::{finisher, label_models, networks};
-use crate::inputs::Inputs;
+use crate::inputs::{Domains, Inputs};
 use crate::stage::Stage;
 
 pub mod cycles;
@@ -44,7 +44,7 @@ use rows::Sampler;
 pub use subject::{Options, Subject};
 use work::Work;
 
-/// Changes when the same rows would give other figures.
+/// Changes when the same rows would give other metrics.
 const VERSION: u32 = 5;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
@@ -115,7 +115,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         version: VERSION,
         of: &subject.of,
         task: subject.task,
-        inputs: inputs.spec(true),
+        inputs: inputs.spec(Domains::Both),
         config: used,
         seeds,
         seed,

@@ -96,7 +96,7 @@ impl Simulation {
         let streams = Streams::new(work.subject.seed).child("diagnosis/models");
         let many = work.options.abundant / 2;
         let wide = work.sampler.sample(many.max(own.len()), widest, "abundant")?.rows;
-        let mut all = work.subject.inputs.target.rows.clone();
+        let mut all = Transitions::clone(&work.subject.inputs.target.rows);
         all.extend(&under_target(place, &wide)?);
         if let Some(source) = source {
             all.extend(&under_target(place, source)?);
@@ -127,7 +127,7 @@ fn abundant_rewards(
     };
     let labels = LabelConfig { learn_terminals: false, ..config.labels.training.clone() };
     let trained = train_labels(&[member], &labels, &mut attempt.checkpoints("abundant-labels")?, device)?;
-    trained.ok_or(Error::Interrupted)
+    trained.ok_or_else(Error::interrupted)
 }
 
 /// V of IQL on target and generated rows, and these rows.
@@ -154,7 +154,7 @@ fn value_function(
     let mut checkpoints = attempt.checkpoints("value")?;
     let outcome = train(&mut value, &rows, steps, "value", &mut checkpoints, device, |_, _| Ok::<_, Error>(()))?;
     match outcome.interrupted {
-        true => Err(Error::Interrupted),
+        true => Err(Error::interrupted()),
         false => Ok((value, rows)),
     }
 }
@@ -182,7 +182,7 @@ impl Models {
             Some(place) => Simulation::of(work, place, sources, source.as_ref(), own, widest)?,
             None => Simulation::default(),
         };
-        let standardizer = even_standardizer(&inputs.target.rows, inputs.source.as_ref().map(|s| &s.rows));
+        let standardizer = even_standardizer(&inputs.target.rows, inputs.source.as_ref().map(|s| &*s.rows));
         let mut members = Vec::new();
         let mut add = |name: &str, rows: &Arc<Transitions>| {
             members.push(Member {
@@ -207,7 +207,7 @@ impl Models {
         let count = members.len();
         let mut checkpoints = attempt.checkpoints("transition-models")?;
         let transition = train_transition_models(members, &options.transition, &mut checkpoints, device)?;
-        let transition = transition.ok_or(Error::Interrupted)?;
+        let transition = transition.ok_or_else(Error::interrupted)?;
 
         let rewards = match &abundant {
             None => None,

@@ -1,11 +1,11 @@
-//! What a diagnosis says of figures that are missing or lack rows.
+//! What a diagnosis says of metrics that are missing or lack rows.
 
 use tce_diagnosis::{Bounds, Curve};
 
 use super::references::References;
 use super::rows::Batch;
 
-/// What is said of rows that are no part of a figure, and of bounds that there are none of.
+/// What is said of rows that are no part of a metric, and of bounds that there are none of.
 pub fn left_out(own: &Batch, theorem: Option<&Bounds>, simulator: bool) -> Vec<String> {
     let mut notes = Vec::new();
     let lost = own.simulated.as_ref().map_or(0, |s| (0..own.len()).filter(|&i| !s.held(i)).count());
@@ -50,7 +50,7 @@ pub fn lost<'a>(batches: impl Iterator<Item = (&'a f32, &'a Batch)>, rows: usize
     let told = |(y, batch): (&f32, &Batch)| {
         format!(
             "{} of {rows} rows generated with y_max = {y} hold numbers that are not finite. They count as rejected, and are part of no \
-             other figure.",
+             other metric.",
             batch.lost
         )
     };
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
     use crate::diagnosis::models::tests::log;
 
-    /// Every figure that is missing has a note.
+    /// Every metric that is missing has a note.
     #[test]
     fn what_is_left_out_is_told() {
         let t = log(&[1, 1]);

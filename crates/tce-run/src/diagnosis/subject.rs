@@ -10,7 +10,7 @@ use crate::inputs::Inputs;
 /// What `tce diagnose` is told.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Options {
-    /// Rows behind every figure.
+    /// Rows behind every metric.
     pub rows: usize,
     /// The label bounds.
     pub y_max: Vec<f32>,

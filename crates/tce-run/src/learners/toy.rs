@@ -38,6 +38,7 @@ impl Method for ToyConfig {
     fn about(&self) -> About {
         About {
             name: "toy",
+            title: "Toy",
             description: "behaviour cloning that skips steps",
             reference: "nobody",
             published: None,

@@ -1,4 +1,4 @@
-//! From finished work to a table that can be trusted.
+//! A verified table of finished work.
 
 use std::fs;
 use std::path::PathBuf;
@@ -34,9 +34,9 @@ pub struct Row {
 pub enum Checked {
     /// It is not done.
     Missing,
-    /// Its files are not what they were, or the record of it is damaged.
+    /// Its files have changed, or its record is damaged.
     Corrupt(String),
-    /// It is done and whole.
+    /// It is finished and verified.
     Done(Outcome),
 }
 
@@ -47,9 +47,9 @@ pub struct Gathered {
     pub rows: Vec<Row>,
     /// Runs that are not done.
     pub missing: Vec<String>,
-    /// Runs whose files are not what they were.
+    /// Runs whose files have changed.
     pub corrupt: Vec<String>,
-    /// Results that came later and differ.
+    /// Later results of the same work that differ.
     pub conflicts: Vec<PathBuf>,
 }
 
@@ -109,7 +109,7 @@ impl Sweep {
 }
 
 impl Gathered {
-    /// What keeps the table from being whole.
+    /// Refuses an incomplete table.
     ///
     /// # Errors
     /// If there is anything, with a list of it.

@@ -11,10 +11,10 @@ use tce_base::format::about;
 use tce_base::{FileError, Headline, Progress, interrupted};
 
 use super::{Entry, Sweep};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
-use crate::processor::Processor;
 
-/// Time between two looks at how long the rest takes.
+/// Time between two estimates of the time left.
 const LOOK: Duration = Duration::from_secs(3);
 
 /// How to share the machine.
@@ -29,12 +29,12 @@ pub struct Share {
     /// Seconds between checkpoints.
     pub save_every: f64,
     /// What computes the networks.
-    pub processor: Processor,
+    pub device: DeviceKind,
 }
 
 impl Sweep {
-    /// Does what is missing, and returns how many pieces of work are not done in the end. Work that was interrupted or killed goes on from
-    /// its checkpoint; pieces that others need come first.
+    /// Does unfinished work, and returns how many pieces are unfinished at the end. Interrupted work resumes from its checkpoint;
+    /// pieces that others need come first.
     ///
     /// # Errors
     /// If a process cannot be started, or the user interrupts; the processes are then given the time to write their checkpoints.
@@ -125,7 +125,7 @@ impl Sweep {
         let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let mut command = Command::new(program);
         command.args(["--threads", &share.threads.to_string(), "--save-every", &share.save_every.to_string()]);
-        command.args(["--device", &share.processor.to_string()]);
+        command.args(["--device", &share.device.to_string()]);
         command.args(["sweep", "run-one"]).arg(&self.directory).arg(entry.index.to_string());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
         // A signal to the terminal's group would reach the workers twice, and a second one ends them at once.
@@ -135,7 +135,7 @@ impl Sweep {
     }
 }
 
-/// What is under way of all pieces of work, and how long the rest takes, where that is known.
+/// Which pieces of work are running, and the time left, where it is known.
 fn headline_of(done: usize, running: usize, all: usize, left: Option<f64>) -> String {
     let pieces = match running {
         0 | 1 => format!("piece {}", (done + running).max(1)),
@@ -154,7 +154,7 @@ fn stop(running: BTreeMap<usize, Child>) -> Error {
     for (_, mut child) in running {
         let _ = child.wait();
     }
-    Error::Interrupted
+    Error::interrupted()
 }
 
 #[cfg(unix)]

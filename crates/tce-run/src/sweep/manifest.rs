@@ -1,4 +1,4 @@
-//! The immutable list of work that a description is turned into.
+//! The list of work of a sweep, which is made once from its description and does not change.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -15,9 +15,9 @@ use crate::inputs::{DataArgs, ensure_data};
 use crate::layers::{Layered, Preset};
 use crate::variant::Variant;
 
-/// More runs than anybody has machines for are a slip of the finger.
+/// More runs than this are taken for a typing error.
 const MOST_RUNS: u64 = 100_000;
-/// Changes when manifests of before cannot be read.
+/// Version of the format. Increase it when older manifests cannot be read.
 const FORMAT: u32 = 1;
 
 /// A sweep's description, `sweep.toml`: tasks × variants × overrides × seeds.
@@ -28,9 +28,9 @@ pub struct Description {
     pub tasks: Vec<String>,
     /// Methods.
     pub variants: Vec<Variant>,
-    /// Whether the floors are run beside them.
-    #[serde(default = "yes")]
-    pub floors: bool,
+    /// Whether the baselines are run beside them.
+    #[serde(default = "yes", alias = "floors")]
+    pub baselines: bool,
     /// Seeds, one run each.
     #[serde(default = "one")]
     pub seeds: u64,
@@ -51,7 +51,7 @@ pub struct Description {
     /// Data files of a task, relative to the description.
     #[serde(default)]
     pub data: BTreeMap<Task, Files>,
-    /// Further settings, each one more column; none means one column without a name.
+    /// Further settings, one column each; empty: one column without a name.
     #[serde(default)]
     pub overrides: Vec<Override>,
 }
@@ -66,7 +66,7 @@ pub struct Files {
     pub target: Option<PathBuf>,
 }
 
-/// A column of its own.
+/// A further column of the table.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Override {
@@ -95,7 +95,9 @@ pub enum Kind {
     /// Distances of source rows to the target's, which several runs share.
     Distances,
     /// Networks, label models and generated rows, which several runs share.
-    Expand,
+    // The name in manifests, from which ids of work are hashed.
+    #[serde(rename = "expand")]
+    Augment,
     /// A policy and its score.
     Run,
 }
@@ -106,7 +108,7 @@ pub enum Kind {
 pub struct Entry {
     /// Its place in the manifest.
     pub index: usize,
-    /// Hash of all that decides its outcome.
+    /// Cache key: hash of all inputs of its result.
     pub id: String,
     /// What it is.
     pub kind: Kind,
@@ -122,7 +124,7 @@ pub struct Entry {
     pub seed: u64,
     /// Hash of its configuration.
     pub config: String,
-    /// Indices of the work that should be done before. Without it the work is done all the same, only twice.
+    /// Indices of work that should be done before. If it is not, this piece does it itself.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<usize>,
 }
@@ -131,7 +133,7 @@ impl Entry {
     /// The method's column in tables.
     pub fn column(&self) -> String {
         let variant = self.variant.map(Variant::name).unwrap_or_default();
-        if self.label.is_empty() { variant } else { format!("{variant} {}", self.label) }
+        if self.label.is_empty() { variant.to_owned() } else { format!("{variant} {}", self.label) }
     }
 }
 
@@ -142,13 +144,13 @@ impl fmt::Display for Entry {
             Kind::Source => write!(f, "{index}: source rows, {}-{}", task.agent, task.source),
             Kind::Target => write!(f, "{index}: target rows, {}-{}-{}", task.agent, task.shift, task.target),
             Kind::Distances => write!(f, "{index}: distances of source rows, {task}"),
-            Kind::Expand => write!(f, "{index}: generated rows, {task}, seed {seed}"),
+            Kind::Augment => write!(f, "{index}: generated rows, {task}, seed {seed}"),
             Kind::Run => write!(f, "{index}: {}, {task}, seed {seed}", self.column()),
         }
     }
 }
 
-/// What holds for all pieces of work.
+/// The part of a manifest that all pieces of work share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header {
@@ -181,7 +183,7 @@ impl Header {
 /// The list of work of a sweep.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Manifest {
-    /// What holds for all of it.
+    /// The shared part.
     pub header: Header,
     /// The work.
     pub entries: Vec<Entry>,
@@ -212,8 +214,8 @@ impl Manifest {
             }
         }
         let mut variants = description.variants.clone();
-        if description.floors {
-            variants.extend(Variant::FLOORS);
+        if description.baselines {
+            variants.extend(Variant::BASELINES);
         }
         let mut seen = BTreeSet::new();
         variants.retain(|v| seen.insert(*v));
@@ -281,7 +283,7 @@ impl Manifest {
         config: &Config,
         seed: u64,
     ) {
-        let text = config.to_toml();
+        let text = config.to_keyed_toml();
         let hash = sha256_hex(text.as_bytes())[..16].to_owned();
         self.header.configs.insert(hash.clone(), text);
         let (data, from_zoo) = (self.header.data.get(&task).cloned().unwrap_or_default(), self.header.from_zoo);
@@ -315,7 +317,7 @@ impl Manifest {
         if generated != GeneratedRows::None || config.mixture.source == SourceRows::Relabelled {
             let own = match generated {
                 GeneratedRows::Synther | GeneratedRows::Dmc => {
-                    serde_json::json!(used_of_single_stage(&config.joint, generated, config.learner.algorithm))
+                    serde_json::json!(used_of_single_stage(&config.single_stage, generated, config.learner.algorithm))
                 }
                 GeneratedRows::Tce | GeneratedRows::None => {
                     let lambda = if config.generator.rows == 0 { config.mixture.lambda } else { 0.0 };
@@ -326,7 +328,7 @@ impl Manifest {
             };
             let spec = serde_json::json!([task, data, from_zoo, rows, generated, own, seed]);
             let before = needs.clone();
-            needs.push(self.add(known, entry(Kind::Expand, spec, seed, before)));
+            needs.push(self.add(known, entry(Kind::Augment, spec, seed, before)));
         }
         let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
         let run = entry(Kind::Run, spec, seed, needs);
@@ -416,7 +418,7 @@ impl Manifest {
     }
 }
 
-/// The tasks that patterns stand for, in the order of the patterns.
+/// The tasks that match the patterns, in the order of the patterns.
 fn tasks(patterns: &[String]) -> Result<Vec<Task>, String> {
     let mut out: Vec<Task> = Vec::new();
     for pattern in patterns {

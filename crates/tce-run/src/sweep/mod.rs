@@ -1,7 +1,7 @@
 //! Sweeps: many runs from one description, on machines that are preempted, crash and fill up.
 //!
-//! `tce sweep plan` turns a description into an immutable list of work, [`Manifest`]; `launch` gives what is missing to processes
-//! of this machine or to Slurm; `gather` turns what is done into a table. The folder, not a queue, is the truth about what is done:
+//! `tce sweep plan` turns a description into an immutable list of work, [`Manifest`]; `launch` gives unfinished work to processes
+//! of this machine or to Slurm; `gather` makes a table of finished work. The folder, not a queue, says what is finished:
 //!
 //! | path in the sweep's folder | content |
 //! |---|---|
@@ -9,7 +9,7 @@
 //! | `runs/` | data, stages and runs, as `tce run --out` leaves them; pieces of work share stages |
 //! | `done/ID.json` | outcome of a piece of work, made by `link(2)`: the first one wins |
 //! | `faults/` | outcomes that came later and differ: faults of determinism |
-//! | `active/`, `failed/`, `logs/`, `slurm/` | who is at work, what failed and why, what was printed, what was submitted |
+//! | `active/`, `failed/`, `logs/`, `slurm/` | running work, failures with reasons, output, submissions |
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -31,6 +31,7 @@ pub mod status;
 pub mod work;
 
 pub use manifest::{Description, Entry, Files, Header, Kind, Manifest, Override};
+pub use repair::Check;
 
 /// The list of work in a sweep's folder.
 const MANIFEST: &str = "manifest.jsonl";
@@ -54,7 +55,7 @@ impl Sweep {
     /// Writes `manifest` into `directory`, unless the same is there already.
     ///
     /// # Errors
-    /// If another manifest is there: work that is done belongs to it.
+    /// If another manifest is there: finished work belongs to it.
     pub fn create(directory: &Path, manifest: Manifest) -> Result<Self> {
         let path = directory.join(MANIFEST);
         let text = manifest.to_jsonl();
@@ -91,7 +92,7 @@ impl Sweep {
         &self.manifest.entries
     }
 
-    /// What a user's own file of a piece of work has become since the sweep was planned; none if it is what it was.
+    /// How a user's own file of a piece of work has changed since the sweep was planned; None if it has not.
     pub fn changed_input(&self, entry: &Entry) -> Option<String> {
         // A file is hashed once as long as its size and time stay; gathering asks for every run.
         static KNOWN: Mutex<BTreeMap<(PathBuf, u64, SystemTime), String>> = Mutex::new(BTreeMap::new());

@@ -1,6 +1,6 @@
-//! Work that counts as done and whose files are gone or changed: it is taken back, and done again by the next launch.
+//! Finished work whose files are missing or changed. It is marked as unfinished, and the next launch does it again.
 //!
-//! Nothing is removed. The record and the files get names that nobody looks for (`.NAME.damaged-N`), beside where they were.
+//! Nothing is removed. The record and the files are renamed to `.NAME.damaged-N`.
 
 use std::fs;
 use std::path::Path;
@@ -11,23 +11,34 @@ use super::work::{Failure, Outcome, now};
 use super::{Entry, Kind, Sweep};
 use crate::error::{Error, Result};
 
+/// What is looked at of files that are there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Check {
+    /// Whether they exist.
+    Existence,
+    /// Their hashes, too.
+    Content,
+}
+
 impl Sweep {
-    /// Takes back what is done and no longer whole, and tells what it was. Whether files exist is always looked at, their content if
-    /// `thorough`.
+    /// Marks damaged work as unfinished, and describes it. `check` says what is looked at.
     ///
     /// # Errors
-    /// If a folder cannot be written; if `thorough`, and a user's own file changed since the sweep was planned.
-    pub fn take_back_damaged(&self, thorough: bool) -> Result<Vec<String>> {
+    /// If a folder cannot be written; with [`Check::Content`], if a user's own file changed since the sweep was planned.
+    pub fn take_back_damaged(&self, check: Check) -> Result<Vec<String>> {
         let mut taken = Vec::new();
         for entry in self.entries() {
             // What was made of the planned file is whole; another file is another sweep.
-            if let Some(change) = self.changed_input(entry).filter(|_| thorough) {
+            if let Some(change) = self.changed_input(entry).filter(|_| check == Check::Content) {
                 return Err(Error::Failed(change));
             }
             let why = match self.outcome(entry) {
                 Ok(None) => continue,
                 Ok(Some(outcome)) => {
-                    let damage = if thorough { self.damage(entry, &outcome) } else { self.lost(&outcome) };
+                    let damage = match check {
+                        Check::Content => self.damage(entry, &outcome),
+                        Check::Existence => self.lost(&outcome),
+                    };
                     let Some(why) = damage else { continue };
                     // A record that is another piece's has that piece's files.
                     if outcome.id == entry.id {
@@ -58,7 +69,7 @@ impl Sweep {
         match entry.kind {
             // These lie in one folder with those of other tasks.
             Kind::Source | Kind::Target => outcome.files.keys().try_for_each(|name| move_aside(&place.join(name))),
-            Kind::Distances | Kind::Expand | Kind::Run => move_aside(&place),
+            Kind::Distances | Kind::Augment | Kind::Run => move_aside(&place),
         }
     }
 }

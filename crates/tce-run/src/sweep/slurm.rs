@@ -1,8 +1,8 @@
-//! A sweep on a cluster that runs Slurm: array jobs of what is missing.
+//! A sweep on a Slurm cluster: array jobs of unfinished work.
 //!
-//! Job numbers are notes only, and `sacct` is not needed: a launch submits what is not done and, as far as `squeue` tells, not
-//! submitted already. Should the queue forget a job, or a node be given up for dead whose processes live on, another launch or a second
-//! copy of the work does no harm (see [`super::work`]).
+//! Job numbers are notes only, and `sacct` is not needed: a launch submits work that is neither finished nor, according to
+//! `squeue`, submitted. If the queue loses a job, or a node that was given up still runs, another launch does no harm: two copies of
+//! the same work are allowed (see [`super::work`]).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -15,8 +15,8 @@ use serde::Serialize;
 use tce_base::{Owner, sha256_hex, write_atomically};
 
 use super::{Kind, Sweep};
+use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
-use crate::processor::Processor;
 
 /// How to submit.
 #[derive(Clone, Debug)]
@@ -28,7 +28,7 @@ pub struct Submission {
     /// Seconds between checkpoints.
     pub save_every: f64,
     /// What computes the networks.
-    pub processor: Processor,
+    pub device: DeviceKind,
     /// Seconds before the time limit at which the work is warned and writes its checkpoint.
     pub grace: u32,
     /// Further arguments of `sbatch`: partition, time limit, memory, account.
@@ -73,15 +73,15 @@ fn call(program: &str, arguments: &[String]) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// The batch script. It waits for the work instead of becoming it: of a batch script that is killed Slurm tells nothing but its
-/// death, and the warning before the time limit goes to the script alone.
+/// The batch script. It starts the work as a child and waits for it: Slurm sends the warning before the time limit to the script
+/// alone, and reports nothing of a script that is killed.
 fn script(sweep: &Path, list: &Path, program: &Path, options: &Submission) -> String {
     let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', r"'\''"));
     format!(
         r#"#!/bin/sh
 # Written by `tce sweep launch`. Element N of the array does the work in line N of the list.
 work=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" {list})
-{program} --threads {threads} --save-every {save_every} --device {processor} sweep run-one {sweep} $work &
+{program} --threads {threads} --save-every {save_every} --device {device} sweep run-one {sweep} $work &
 run=$!
 warned=0
 trap 'warned=1; kill -USR1 $run 2>/dev/null' USR1
@@ -104,7 +104,7 @@ exit $code
         sweep = quoted(sweep),
         threads = options.threads,
         save_every = options.save_every,
-        processor = options.processor,
+        device = options.device,
     )
 }
 
@@ -139,7 +139,7 @@ impl Sweep {
         let missing = self.missing()?;
         let mut arrays: Vec<Array> = Vec::new();
         let mut before: Vec<String> = Vec::new();
-        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Distances, Kind::Expand], &[Kind::Run]] {
+        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Distances, Kind::Augment], &[Kind::Run]] {
             let due = missing.iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index));
             let due: Vec<usize> = due.map(|e| e.index).collect();
             let elements: Vec<Vec<usize>> = due.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();
@@ -278,7 +278,7 @@ mod tests {
             pack: 1,
             threads: 3,
             save_every: 20.0,
-            processor: Processor::Vulkan,
+            device: DeviceKind::Vulkan,
             grace: 60,
             arguments: vec![],
             dry_run: false,

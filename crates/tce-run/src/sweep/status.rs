@@ -1,4 +1,4 @@
-//! How far a sweep is.
+//! The progress of a sweep.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,7 +11,7 @@ use super::work::{Active, Failure, now};
 use super::{Entry, Kind, Sweep};
 use crate::error::{Error, Result};
 
-/// Without a sign of life for so long, a process counts as lost.
+/// A process without a heartbeat for so long counts as lost.
 const SILENCE: Duration = Duration::from_secs(60);
 
 /// The state of all work of a sweep.
@@ -19,26 +19,26 @@ const SILENCE: Duration = Duration::from_secs(60);
 pub struct Status {
     /// The sweep.
     pub name: String,
-    /// Pieces of work by kind: done, and in all.
+    /// Pieces of work by kind: finished, and all.
     pub kinds: BTreeMap<Kind, (usize, usize)>,
-    /// At work now.
+    /// Running now.
     pub running: Vec<Running>,
-    /// Indices of what failed and is neither done nor at work.
+    /// Indices of failed work that is neither finished nor running.
     pub failed: Vec<(usize, String)>,
     /// Where the logs are.
     pub logs: PathBuf,
-    /// Indices of what is neither done, at work nor failed.
+    /// Indices of work that is neither finished, running nor failed.
     pub waiting: Vec<usize>,
-    /// Results that came later and differ.
+    /// Later results of the same work that differ.
     pub faults: usize,
-    /// Seconds until everything is done, if as many stay at work as now; None as long as nothing is done of what is left, where
-    /// something failed, and where nobody is at work.
+    /// Seconds until everything is done, if as many processes keep running; None if nothing of this kind is finished yet, if
+    /// something failed, and if nothing is running.
     pub seconds_left: Option<f64>,
     /// Scores so far: task, method, scores.
     pub scores: Vec<(String, String, Vec<f64>)>,
 }
 
-/// Somebody at work.
+/// A piece of work that is running.
 #[derive(Clone, Debug, Serialize)]
 pub struct Running {
     /// The work.
@@ -47,7 +47,7 @@ pub struct Running {
     pub what: String,
     /// Machine and process.
     pub owner: String,
-    /// For so many seconds.
+    /// Seconds since it began.
     pub seconds: u64,
 }
 
@@ -108,7 +108,7 @@ impl Sweep {
         Ok(status)
     }
 
-    /// Who is at work, by the work's id.
+    /// Running processes, by the work's id.
     fn active(&self) -> BTreeMap<String, Vec<Active>> {
         let mut out: BTreeMap<String, Vec<Active>> = BTreeMap::new();
         for file in fs::read_dir(self.directory.join("active")).into_iter().flatten().flatten() {
@@ -136,7 +136,7 @@ impl Status {
         self.kinds.get(&Kind::Run).is_none_or(|(done, all)| done == all)
     }
 
-    /// Whether what is left will not get done: something failed, and nobody is at work.
+    /// Whether the rest will not be done: something failed, and nothing is running.
     pub fn stuck(&self) -> bool {
         !self.failed.is_empty() && self.running.is_empty()
     }

@@ -1,4 +1,4 @@
-//! Doing one piece of work, once or by several copies at once.
+//! One piece of work, done by one process or by several copies at once.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,15 +12,15 @@ use tce_base::{FileError, Owner, PROGRAM, read_if_there, sha256_file, write_json
 use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
+use crate::augment::{augment_rows, label_models};
 use crate::config::GeneratedRows;
 use crate::error::{Error, Result};
-use crate::expand::{expand, label_models};
 use crate::inputs::{Inputs, source_file, target_file};
 use crate::mixture::distances_stage;
 use crate::pipeline::run;
 use crate::stage::files_of;
 
-/// Time between two signs of life.
+/// Seconds between two heartbeats.
 const BEAT: Duration = Duration::from_secs(10);
 
 /// The outcome of a piece of work.
@@ -36,7 +36,7 @@ pub struct Outcome {
     pub files: BTreeMap<String, String>,
     /// Seconds it took.
     pub seconds: f64,
-    /// Most memory of the process meanwhile, in bytes, where the system tells it.
+    /// Peak memory of the process, in bytes, where the system reports it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory: Option<u64>,
     /// The program that did it.
@@ -44,7 +44,7 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Whether two copies of the work came to the same.
+    /// Whether two copies of the work have the same result.
     pub fn agrees(&self, other: &Self) -> bool {
         (&self.id, &self.place, &self.files, self.score.map(f64::to_bits))
             == (&other.id, &other.place, &other.files, other.score.map(f64::to_bits))
@@ -60,7 +60,7 @@ pub struct Failure {
     pub at: u64,
 }
 
-/// Who is at work.
+/// A running process.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Active {
     /// Machine and process.
@@ -76,20 +76,20 @@ pub fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
 }
 
-/// Lets the peak of this process's memory begin anew, so that pieces of work that share a process have their own. Where the
-/// system cannot do that, a later piece has the peak of all before it.
+/// Resets the peak memory of this process, so that each piece of work in it has its own. Where the system cannot do that, a
+/// later piece has the peak of all earlier ones.
 fn forget_peak_memory() {
     let _ = fs::write("/proc/self/clear_refs", "5");
 }
 
-/// Most memory that this process had at a time, in bytes.
+/// Peak memory of this process, in bytes.
 fn peak_memory() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let kilobytes = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.split_whitespace().next()?;
     Some(kilobytes.parse::<u64>().ok()? * 1024)
 }
 
-/// A file in `active/` that is touched as long as this lives.
+/// A heartbeat: a file in `active/` that is touched until this is dropped.
 struct Heartbeat {
     path: PathBuf,
     stop: Arc<AtomicBool>,
@@ -166,7 +166,7 @@ impl Sweep {
     /// Does a piece of work, unless it is done.
     ///
     /// # Errors
-    /// What went wrong, which is also kept in `failed/`; if a copy of the work came to another result before.
+    /// The failure, which is also stored in `failed/`; or if an earlier copy of the work has another result.
     pub fn work(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
         if let Some(outcome) = self.outcome(entry)? {
             return Ok(outcome);
@@ -198,11 +198,11 @@ impl Sweep {
         let (score, place, files) = match entry.kind {
             Kind::Source => data_file(&source_file(entry.task, &args, config.source.rows)?)?,
             Kind::Target => data_file(&target_file(entry.task, &args)?)?,
-            Kind::Expand => {
+            Kind::Augment => {
                 let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let stage = match config.mixture.generated {
                     GeneratedRows::None => label_models(&inputs, &config.labels, seeds, root, device)?.1,
-                    _ => expand(&inputs, &config, seeds, root, device)?.stage,
+                    _ => augment_rows(&inputs, &config, seeds, root, device)?.stage,
                 };
                 (None, stage.directory().to_owned(), files_of(stage.directory())?)
             }
@@ -233,7 +233,7 @@ impl Sweep {
     /// Makes `outcome` the work's outcome, unless a copy of the work was first.
     ///
     /// # Errors
-    /// If that copy came to another result: both are kept.
+    /// If that copy has another result: both are kept.
     pub fn settle(&self, outcome: Outcome) -> Result<Outcome> {
         let path = self.file("done", &format!("{}.json", outcome.id));
         if write_json_first(&path, &outcome)? {
@@ -265,7 +265,8 @@ mod tests {
     fn the_first_outcome_stays_and_another_one_is_a_fault() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("s.toml");
-        fs::write(&path, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nfloors = false\n").unwrap();
+        fs::write(&path, "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"bc\"]\nbaselines = false\n")
+            .unwrap();
         let sweep = Sweep::create(&dir.path().join("s"), Manifest::plan(&path).unwrap()).unwrap();
         let entry = sweep.entries().last().unwrap();
         let outcome = |score: f64, seconds: f64| Outcome {

@@ -7,9 +7,9 @@ use serde::Serialize;
 use tce_augment::config::Length;
 use tce_base::{set_quiet, write_json};
 use tce_nn::Device;
+use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
 use tce_run::layers::{Layered, Preset};
-use tce_run::processor::Processor;
 
 use crate::bench::{Measured, On, measure, names, simulates};
 use crate::output::{Output, table};
@@ -39,7 +39,7 @@ struct Report {
     program: String,
     processor: String,
     /// What computed the networks.
-    device: Processor,
+    device: DeviceKind,
     seeds: u64,
     instructions: &'static str,
     threads: usize,
@@ -62,7 +62,7 @@ struct WholeTask {
 
 impl Bench {
     /// Runs the command.
-    pub fn run(self, output: Output, kind: Processor, device: &Device) -> Result<()> {
+    pub fn run(self, output: Output, kind: DeviceKind, device: &Device) -> Result<()> {
         if self.repeats == 0 || self.seeds == 0 || self.seconds.is_nan() || self.seconds < 0.0 {
             return Err(Error::Usage("--repeats and --seeds must be at least 1, --seconds not negative".into()));
         }
@@ -90,7 +90,7 @@ impl Bench {
             instructions: tce_nn::instructions(),
             threads: rayon::current_num_threads(),
             core_gflops,
-            whole_task: if kind == Processor::Cpu && self.seeds == 1 { whole_task(&workloads)? } else { None },
+            whole_task: if kind == DeviceKind::Cpu && self.seeds == 1 { whole_task(&workloads)? } else { None },
             workloads,
         };
         if let Some(path) = &self.out {
@@ -140,9 +140,9 @@ fn render(report: &Report) -> String {
         let number = |x: f64| if x >= 1000.0 { format!("{x:.0}") } else { format!("{x:.1}") };
         let products = |text: String| if m.gflops > 0.0 { text } else { "-".into() };
         // The CPU's rate is no measure of a GPU.
-        let share = if report.device == Processor::Cpu { format!("{:.0} %", 100.0 * m.share) } else { "-".into() };
+        let share = if report.device == DeviceKind::Cpu { format!("{:.0} %", 100.0 * m.share) } else { "-".into() };
         [
-            m.name.to_owned(),
+            m.name.clone(),
             format!("{} {}/s", number(m.per_second), m.unit),
             format!("{} .. {}", number(m.range[0]), number(m.range[1])),
             products(format!("{:.1}", m.gflops)),

@@ -5,7 +5,7 @@ use clap::Command;
 /// All commands, in groups, in the order in which a reader wants them.
 const GROUPS: [(&str, &[&str]); 6] = [
     ("The main job", &["run"]),
-    ("Your own data", &["data", "augment", "learn", "judge"]),
+    ("Your own data", &["data", "augment", "learn", "compare"]),
     ("Policies and their data", &["evaluate", "export", "collect", "train-sac", "zoo"]),
     ("Many runs", &["sweep", "report"]),
     ("Looking deeper", &["diagnose", "config", "bench"]),
@@ -30,7 +30,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("a result: five seeds", "tce run 'ant-gravity:medium->expert' --seeds 5"),
             (
                 "two methods, without the simple ones",
-                "tce run 'hopper-morph:medium->expert' --variant tce-og,otdf --no-floors",
+                "tce run 'hopper-morph:medium->expert' --variant tce-og,otdf --no-baselines",
             ),
             ("other settings", "tce run 'hopper-morph:medium->expert' --set generator.y_max=0.1"),
         ],
@@ -65,16 +65,16 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             ("returns and score", "tce evaluate zoo:hopper-source-expert --env hopper --episodes 20"),
             (
-                "a film beside the robot as it was",
+                "a video beside the robot as it was",
                 "tce evaluate policy.safetensors --env hopper-morph --video fall.gif",
             ),
         ],
     ),
     (
-        "judge",
+        "compare",
         &[(
             "two policies without a simulator",
-            "tce judge a.safetensors b.safetensors --source old.hdf5 --target new.hdf5",
+            "tce compare a.safetensors b.safetensors --source old.hdf5 --target new.hdf5",
         )],
     ),
     (

@@ -43,7 +43,7 @@ pub struct Learn {
     /// The source's rows, to try the policies in learned dynamics of both robots. Without them the target's rows alone are known.
     #[arg(long, value_name = "FILE", help_heading = "Verdict")]
     source: Option<PathBuf>,
-    /// Do not learn a floor from the target rows alone, do not try the policies, and recommend none.
+    /// Do not learn a baseline from the target rows alone, do not try the policies, and recommend none.
     #[arg(long, help_heading = "Verdict")]
     no_verdict: bool,
     /// Directory for policies and metrics.
@@ -97,7 +97,7 @@ fn render(report: &Trained) -> String {
         text.extend(report.policies.iter().map(|p| format!("{}\n", p.display())));
     }
     for (m, seed) in report.seeds.iter().enumerate() {
-        let broken = report.learned.figures.iter().filter(|(_, values)| values.get(m).is_some_and(Option::is_none));
+        let broken = report.learned.metrics.iter().filter(|(_, values)| values.get(m).is_some_and(Option::is_none));
         let names: Vec<_> = broken.map(|(name, _)| name.as_str()).collect();
         if !names.is_empty() {
             text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
@@ -106,7 +106,7 @@ fn render(report: &Trained) -> String {
     if let Some(kept) = &report.verdict {
         let rows = kept.verdict.tried.iter().map(|t| {
             [
-                if t.floor { format!("{} (baseline)", t.name) } else { t.name.clone() },
+                if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
                 format!("{:.1} ± {:.1}", t.imagined_return, t.standard_error),
                 format!("{:.0} %", 100.0 * t.survival),
                 t.fitted_q.map_or("-".into(), |[value, error]| format!("{value:.1} ± {error:.1}")),

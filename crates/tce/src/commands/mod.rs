@@ -4,14 +4,15 @@ use std::ffi::OsString;
 use std::sync::{Mutex, PoisonError};
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
-use tce_run::processor::Processor;
 
 use crate::output::{Form, Output};
 
 mod augment;
 mod bench;
 mod collect;
+mod compare;
 mod completions;
 mod config;
 mod data;
@@ -19,7 +20,6 @@ mod diagnose;
 mod evaluate;
 mod export;
 mod help;
-mod judge;
 mod learn;
 mod man;
 mod refuse;
@@ -48,7 +48,7 @@ pub struct Cli {
     save_every: f64,
     /// What computes the networks.
     #[arg(long, global = true, value_enum, default_value_t, help_heading = "Global options")]
-    device: Processor,
+    device: DeviceKind,
     #[command(subcommand)]
     command: Command,
 }
@@ -61,12 +61,13 @@ enum Command {
     Augment(augment::Augment),
     /// Learn a policy from data sets.
     Learn(learn::Learn),
-    /// Try policies in the simulator: returns, scores, films.
+    /// Try policies in the simulator: returns, scores, videos.
     Evaluate(evaluate::Evaluate),
     /// Write a policy as an ONNX model, for other programs.
     Export(export::Export),
     /// Compare policies by the two data sets alone, in learned dynamics; no simulator needed.
-    Judge(judge::JudgeArgs),
+    #[command(visible_alias = "judge")]
+    Compare(compare::CompareArgs),
     /// Train actors by soft actor-critic in the simulator, for data of any quality.
     TrainSac(train_sac::TrainSac),
     /// Look at and try the actors that come with the program.
@@ -158,7 +159,7 @@ impl Cli {
             Command::Learn(args) => args.run(output, &device()?),
             Command::Evaluate(args) => args.run(output),
             Command::Export(args) => args.run(output),
-            Command::Judge(args) => args.run(output, &device()?),
+            Command::Compare(args) => args.run(output, &device()?),
             Command::TrainSac(args) => args.run(output, &device()?),
             Command::Zoo(command) => command.run(output),
             Command::Collect(args) => args.run(output),

@@ -84,7 +84,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
             format!("{:.1}", mean.point),
             format!("{:.1}", iqm.point),
             range(iqm.interval, 1),
-            if analysis.methods[a.method].floor { "baseline".into() } else { "method".into() },
+            if analysis.methods[a.method].baseline { "baseline".into() } else { "method".into() },
         ]
     });
     let interval = format!("{:.0} % interval", 100.0 * c.level);
@@ -101,7 +101,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
             0
         )
     );
-    if let Some(floor) = c.standard() {
+    if let Some(baseline) = c.standard() {
         let rows: Vec<_> = c
             .methods
             .iter()
@@ -125,7 +125,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
                     &format!(
                         "Against the best baseline, {}. points: above it. P(higher): share of pairs of runs in which the method's is \
                          higher, 0.5 is no difference. p: how often chance alone does that.",
-                        analysis.methods[floor.method].title
+                        analysis.methods[baseline.method].title
                     ),
                     0
                 ),

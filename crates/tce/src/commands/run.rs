@@ -10,8 +10,8 @@ use tce_run::config::{Algorithm, Config, GeneratedRows, SourceRows};
 use tce_run::course::Course;
 use tce_run::error::{Error, Result};
 use tce_run::inputs::{Behaviour, DataArgs, Inputs};
-use tce_run::judge::Judge;
 use tce_run::layers::ConfigArgs;
+use tce_run::off_policy_evaluation::OffPolicyEvaluator;
 use tce_run::pipeline::{Summary, run, seeds};
 use tce_run::variant::Variant;
 use tce_run::verdict::{Candidate, Kept, keep, only, recommend};
@@ -35,14 +35,14 @@ pub struct Run {
     seed: u64,
     #[command(flatten)]
     data: DataArgs,
-    /// Leave out the floors (cloning with raw and with standardised observations, cloning of the best half, IQL on the target
+    /// Leave out the baselines (cloning with raw and with standardised observations, cloning of the best half, IQL on the target
     /// alone).
-    #[arg(long, help_heading = "What stands beside it")]
-    no_floors: bool,
+    #[arg(long, alias = "no-floors", help_heading = "What stands beside it")]
+    no_baselines: bool,
     /// Do not try the policies in learned dynamics, and recommend none.
     #[arg(long, help_heading = "What stands beside it")]
     no_verdict: bool,
-    /// Another learner for the methods, not for the floors (`tce learn --list`).
+    /// Another learner for the methods, not for the baselines (`tce learn --list`).
     #[arg(long, value_enum, help_heading = "What is learned")]
     learner: Option<Algorithm>,
     #[command(flatten)]
@@ -66,7 +66,7 @@ struct Report {
 struct Row {
     title: String,
     variant: Variant,
-    floor: bool,
+    baseline: bool,
     #[serde(flatten)]
     summary: Summary,
 }
@@ -74,24 +74,24 @@ struct Row {
 impl Run {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::FLOORS.contains(v))) {
+        if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::BASELINES.contains(v))) {
             return Err(Error::Usage(format!(
-                "--learner {}: found floors alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
+                "--learner {}: found baselines alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
                 learner.about().name,
                 self.variant.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
             )));
         }
         let mut variants: Vec<(Variant, bool)> = Vec::new();
-        if !self.no_floors {
-            let floors = Variant::FLOORS.into_iter().filter(|f| !self.variant.contains(f));
-            variants.extend(floors.map(|v| (v, true)));
+        if !self.no_baselines {
+            let baselines = Variant::BASELINES.into_iter().filter(|f| !self.variant.contains(f));
+            variants.extend(baselines.map(|v| (v, true)));
         }
-        variants.extend(self.variant.iter().map(|&v| (v, Variant::FLOORS.contains(&v))));
+        variants.extend(self.variant.iter().map(|&v| (v, Variant::BASELINES.contains(&v))));
         // Every configuration is read before anything is computed.
         let configs = variants
             .iter()
-            .map(|(v, floor)| {
-                let learner = self.learner.filter(|_| !floor);
+            .map(|(v, baseline)| {
+                let learner = self.learner.filter(|_| !baseline);
                 self.config.clone().with_learner(learner).layered(Some(self.task), Some(*v))?.config()
             })
             .collect::<Result<Vec<_>>>()?;
@@ -104,10 +104,10 @@ impl Run {
         tce_base::begin_step("data");
         let inputs = Inputs::of_config(self.task, &self.data, widest)?;
         let mut rows = Vec::new();
-        for ((variant, floor), config) in variants.into_iter().zip(&configs) {
+        for ((variant, baseline), config) in variants.into_iter().zip(&configs) {
             let place = self.task.directory();
-            let summary = run(&variant.name(), &inputs, config, &seeds, &self.data.out, &place, device)?;
-            rows.push(Row { title: variant.row_title(config), variant, floor, summary });
+            let summary = run(variant.name(), &inputs, config, &seeds, &self.data.out, &place, device)?;
+            rows.push(Row { title: variant.row_title(config), variant, baseline, summary });
         }
         let verdict = match self.no_verdict {
             true => None,
@@ -115,7 +115,7 @@ impl Run {
         };
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
         let scored = |row: &Row| {
-            Scored::new(&row.title, row.floor, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
+            Scored::new(&row.title, row.baseline, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
         };
         let recommended = verdict.as_ref().map(|v| v.verdict.method.as_str());
         let scored: Vec<_> = rows.iter().map(scored).collect();
@@ -133,7 +133,7 @@ impl Run {
         for ((variant, _), config) in variants.iter().zip(configs) {
             let mixed = config.mixture.generated != GeneratedRows::None || config.mixture.source != SourceRows::None;
             course.generating(config);
-            course.learning(&variant.name(), config, mixed);
+            course.learning(variant.name(), config, mixed);
         }
         if !self.no_verdict {
             course.verdict(&configs[0]);
@@ -144,11 +144,11 @@ impl Run {
     /// Recommends one of the policies of `rows`, and puts it beside the runs.
     fn verdict(&self, inputs: &Inputs, rows: &[Row], dynamics: &DynamicsConfig, device: &Device) -> Result<Kept> {
         let candidate =
-            |row: &Row| Candidate { name: row.title.clone(), floor: row.floor, files: row.summary.policies() };
-        let judge = || Judge::train(inputs, dynamics, &self.data.out, device);
+            |row: &Row| Candidate { name: row.title.clone(), baseline: row.baseline, files: row.summary.policies() };
+        let evaluator = || OffPolicyEvaluator::train(inputs, dynamics, &self.data.out, device);
         let candidates: Vec<_> = rows.iter().map(candidate).collect();
-        // The simulator has judged a single policy already.
-        let verdict = only(&candidates).map_or_else(|| recommend(judge, &candidates, None), Ok)?;
+        // The simulator has estimates a single policy already.
+        let verdict = only(&candidates).map_or_else(|| recommend(evaluator, &candidates, None), Ok)?;
         keep(verdict, &self.data.out.join(self.task.directory()))
     }
 }
@@ -167,7 +167,7 @@ fn render(report: &Report) -> String {
         let seeds = r.summary.seeds.len();
         let failed = r.summary.learned.evaluations.iter().filter(|e| e.failed.is_some()).count();
         [
-            if r.floor { format!("{} (floor)", r.title) } else { r.title.clone() },
+            if r.baseline { format!("{} (baseline)", r.title) } else { r.title.clone() },
             plus_minus(&scores),
             plus_minus(&returns),
             if failed > 0 { format!("{seeds} ({failed} diverged)") } else { seeds.to_string() },
@@ -190,7 +190,7 @@ fn render(report: &Report) -> String {
     let header = ["method", "score", "return", "seeds", "other rows", "time"];
     let mut text = format!("{}\n{}\n", heading(&report.task.to_string()), table(&header, lines));
     let generated = report.rows.iter().filter(|r| !r.summary.generated.is_empty()).map(|r| {
-        let mean = |f: &dyn Fn(&tce_run::expand::Generated) -> f64| {
+        let mean = |f: &dyn Fn(&tce_run::augment::Generated) -> f64| {
             r.summary.generated.iter().map(f).sum::<f64>() / r.summary.generated.len() as f64
         };
         // Where the generator makes whole transitions there are no label models.

@@ -173,7 +173,7 @@ impl TrainSac {
             rows.push(Row { environment, seed, directory, ledger, steps_per_second });
         }
         if tce_base::interrupted() {
-            return Err(Error::Interrupted);
+            return Err(Error::interrupted());
         }
         output.print(&rows, |rows| {
             let lines = rows.iter().map(|r| {

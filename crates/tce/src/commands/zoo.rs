@@ -9,7 +9,7 @@ use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
 use tce_run::error::{Error, Result};
-use tce_zoo::actors::{Arena, Evaluation, evaluate};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 use tce_zoo::exhibits::{Card, Exhibit};
 
 use crate::output::{Output, table};
@@ -187,7 +187,8 @@ impl Rollout {
         let mut all = Vec::new();
         for exhibit in exhibits {
             let card = exhibit.card()?;
-            let evaluation = judge(&exhibit.policy()?, &card, self.episodes, Streams::new(self.seed), self.mean)?;
+            let evaluation =
+                evaluate_card(&exhibit.policy()?, &card, self.episodes, Streams::new(self.seed), self.mean)?;
             all.push(Rolled { name: exhibit.name.to_owned(), card, evaluation });
         }
         output.print(&all, |all| {
@@ -208,13 +209,13 @@ impl Rollout {
     }
 }
 
-fn judge(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
+fn evaluate_card(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
     let arena = Arena::new(card.agent, card.shift, ScoreTable::default());
-    Ok(evaluate(policy, arena, episodes, streams, mean, interrupted)?)
+    Ok(evaluate(policy, arena, episodes, streams, Actions::mean_if(mean), interrupted)?)
 }
 
 impl Keep {
-    /// What is known of the policy before it is judged.
+    /// What is known of the policy before it is evaluated.
     fn card(&self, parameters: &NamedParameters) -> Result<Card> {
         let written = Card::of(parameters, &self.policy)?;
         let (Some((agent, shift)), Some(rows)) = (self.env, &self.cloned_from) else {
@@ -245,11 +246,11 @@ impl Keep {
         tce_sim::open_library()?;
         let full = NamedParameters::load(&self.policy)?;
         let card = self.card(&full)?;
-        // What is judged is what will be read back.
+        // What is evaluated is what will be read back.
         let mut parameters = full.to_half();
         let policy = Policy::from_parameters(&parameters, &self.policy)?;
         let streams = Streams::new(card.seed ^ u64::MAX);
-        let evaluation = judge(&policy, &card, self.episodes, streams, false)?;
+        let evaluation = evaluate_card(&policy, &card, self.episodes, streams, false)?;
         let (mean, std) = mean_std(&evaluation.returns);
         let (length, score, episodes) = (evaluation.mean_length(), evaluation.score, self.episodes);
         let card = Card { role: Some(self.role), episodes, mean, std, length, score, ..card };

@@ -37,7 +37,7 @@ impl Output<'_> {
     pub fn print<T: Serialize>(&self, value: &T, render: impl FnOnce(&T) -> String) {
         use std::io::Write;
         // The command is at its end, and so are its steps.
-        tce_base::end_course(true);
+        tce_base::end_course(tce_base::LastStep::Done);
         let text = match self.form {
             Form::Json => serde_json::to_string_pretty(value).expect("results are plain data"),
             Form::Csv => csv::of(&serde_json::to_string(value).expect("results are plain data")),

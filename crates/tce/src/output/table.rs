@@ -172,7 +172,8 @@ mod tests {
 
     fn shown(width: Option<usize>) -> String {
         let header = texts(&["method", "score", "other rows"]);
-        let rows = [texts(&["BC, raw observations (floor)", "85.4", "0"]), texts(&["TCE(OG)", "95.9 ± 1.2", "16321"])];
+        let rows =
+            [texts(&["BC, raw observations (baseline)", "85.4", "0"]), texts(&["TCE(OG)", "95.9 ± 1.2", "16321"])];
         fitted(&header, &rows, width, false)
     }
 
@@ -182,7 +183,7 @@ mod tests {
 ┌──────────────────────────────┬────────────┬────────────┐
 │ method                       ┆ score      ┆ other rows │
 ╞══════════════════════════════╪════════════╪════════════╡
-│ BC, raw observations (floor) ┆       85.4 ┆          0 │
+│ BC, raw observations (baseline) ┆       85.4 ┆          0 │
 │ TCE(OG)                      ┆ 95.9 ± 1.2 ┆      16321 │
 └──────────────────────────────┴────────────┴────────────┘";
         assert_eq!(shown(None), expected);
@@ -198,7 +199,7 @@ mod tests {
 ╞════════════════════╪════════════╪═══════╡
 │ BC, raw            ┆       85.4 ┆     0 │
 │ observations       ┆            ┆       │
-│ (floor)            ┆            ┆       │
+│ (baseline)            ┆            ┆       │
 │ TCE(OG)            ┆ 95.9 ± 1.2 ┆ 16321 │
 └────────────────────┴────────────┴───────┘";
         assert_eq!(shown(Some(43)), expected);

@@ -29,7 +29,7 @@ pub fn describe(directory: &Path, name: &str, seeds: u64) -> String {
     let sets: Vec<String> = SETS.iter().map(|s| format!("{s:?}")).collect();
     let file = format!("{name}.toml");
     let text = format!(
-        "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"tce-og\", \"tce-no-reg\", \"bc\"]\nfloors = false\n\
+        "tasks = [\"hopper-morph:medium->expert\"]\nvariants = [\"tce-og\", \"tce-no-reg\", \"bc\"]\nbaselines = false\n\
          seeds = {seeds}\nset = [{}]\nfrom_zoo = true\n",
         sets.join(", ")
     );

@@ -1,4 +1,7 @@
+use tce_learn::Mode;
+
 use super::*;
+use crate::config::Algorithm;
 
 pub fn plan(text: &str) -> Result<Manifest> {
     let dir = tempfile::tempdir().unwrap();
@@ -20,7 +23,7 @@ fn runs_share_what_they_need() {
     let count = |kind| manifest.entries.iter().filter(|e| e.kind == kind).count();
     assert_eq!(count(Kind::Run), 2 * (3 + 5) * 2);
     // Two methods of one seed learn from the same generated rows.
-    assert_eq!(count(Kind::Expand), 2 * 2);
+    assert_eq!(count(Kind::Augment), 2 * 2);
     assert_eq!((count(Kind::Source), count(Kind::Target)), (1, 2));
     for entry in &manifest.entries {
         assert!(entry.needs.iter().all(|&n| manifest.entries[n].kind < entry.kind), "{entry}");
@@ -32,12 +35,12 @@ fn runs_share_what_they_need() {
 }
 
 #[test]
-fn rivals_share_their_generated_rows() {
+fn prior_methods_share_their_generated_rows() {
     let manifest = plan(
         r#"
         tasks = ["hopper-morph:medium->expert"]
         variants = ["dmc", "dmc-published", "synther", "tce-og"]
-        floors = false
+        baselines = false
         seeds = 2
         overrides = [
             { name = "", set = [] },
@@ -52,17 +55,17 @@ fn rivals_share_their_generated_rows() {
         let kinds = entry.needs.iter().map(|&n| manifest.entries[n].kind).collect::<Vec<_>>();
         (entry.needs.last().copied().unwrap(), kinds)
     };
-    let (dmc, kinds) = needs(Variant::Dmc, "", 0);
-    assert_eq!(kinds, [Kind::Target, Kind::Source, Kind::Expand]);
-    assert_eq!(needs(Variant::DmcPublished, "", 0).0, dmc);
+    let (dmc, kinds) = needs(Variant::Prior(Algorithm::Dmc, Mode::Corrected), "", 0);
+    assert_eq!(kinds, [Kind::Target, Kind::Source, Kind::Augment]);
+    assert_eq!(needs(Variant::Prior(Algorithm::Dmc, Mode::Published), "", 0).0, dmc);
     // Neither what the learner does with them, nor the keys of another generator, makes other rows.
-    assert_eq!(needs(Variant::Dmc, "w", 0).0, dmc);
+    assert_eq!(needs(Variant::Prior(Algorithm::Dmc, Mode::Corrected), "w", 0).0, dmc);
     let (synther, kinds) = needs(Variant::Synther, "", 0);
-    assert_eq!(kinds, [Kind::Target, Kind::Expand], "SynthER looks at no source");
+    assert_eq!(kinds, [Kind::Target, Kind::Augment], "SynthER looks at no source");
     assert_eq!(needs(Variant::Synther, "w", 0).0, synther);
-    assert_ne!(needs(Variant::Dmc, "", 1).0, dmc);
+    assert_ne!(needs(Variant::Prior(Algorithm::Dmc, Mode::Corrected), "", 1).0, dmc);
     // dmc and synther, and tce-og under two y_max, of two seeds.
-    assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Expand).count(), 2 * (2 + 2));
+    assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Augment).count(), 2 * (2 + 2));
 }
 
 #[test]

@@ -8,10 +8,10 @@ use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
+use tce_run::augment::{finisher, label_models, networks};
 use tce_run::diagnosis::cycles::{Asked, AtCycle, Cycles, cycles};
 use tce_run::diagnosis::generator::{Consistency, Quality, Tried, consistency, hold_out, step_std};
 use tce_run::error::Result;
-use tce_run::expand::{finisher, label_models, networks};
 use tce_run::inputs::{DataArgs, Inputs};
 use tce_run::layers::ConfigArgs;
 use tce_run::variant::Variant;
@@ -23,7 +23,7 @@ use crate::output::{Output, table};
 pub struct GeneratorArgs {
     /// The task.
     task: Task,
-    /// Rows to sample for each figure.
+    /// Rows to sample for each metric.
     #[arg(long, default_value_t = 4096)]
     rows: usize,
     /// Share of the target rows (whole episodes) to hold out.

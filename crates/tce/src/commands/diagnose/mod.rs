@@ -66,7 +66,7 @@ struct RunArgs {
     /// The seed to look at (default: the run's first, or 0).
     #[arg(long)]
     seed: Option<u64>,
-    /// Rows behind every figure.
+    /// Rows behind every metric.
     #[arg(long, default_value_t = Options::default().rows, help_heading = "What is measured")]
     rows: usize,
     /// Label bounds, separated by commas; 0 and the run's own are among them in any case.
@@ -186,7 +186,7 @@ impl RunArgs {
         for (name, value) in [("--rows", self.rows), ("--abundant", self.abundant)] {
             if value < least {
                 return Err(Error::Usage(format!(
-                    "{name} {value}: expected at least {least}; figures of fewer rows are noise"
+                    "{name} {value}: expected at least {least}; metrics of fewer rows are noise"
                 )));
             }
         }

@@ -7,13 +7,13 @@ use tce_diagnosis::{AtBound, Diagnosis, Reliability, Spread};
 
 use crate::output::{prose, table};
 
-/// What to do with the rows, the figures behind it, and where the rest is.
+/// What to do with the rows, the metrics behind it, and where the rest is.
 pub fn render(d: &Diagnosis, files: &[PathBuf]) -> String {
     let mut parts = Vec::new();
     let mut advice = prose(&d.advice().to_string(), 0);
     advice.extend(d.choice.iter().map(|c| format!("\n{}", prose(&c.sentence(), 0))));
     parts.push(advice);
-    parts.push(format!("{}, seed {}, {} generated rows behind every figure", d.of, d.seed, d.rows));
+    parts.push(format!("{}, seed {}, {} generated rows behind every metric", d.of, d.seed, d.rows));
     parts.push(reach(d));
     parts.push(errors(d));
     parts.push(rest(d));
@@ -63,10 +63,10 @@ fn reach(d: &Diagnosis) -> String {
 
 /// Errors over y_max, of kept rows and of rejected ones.
 fn errors(d: &Diagnosis) -> String {
-    let figure = |s: Option<Spread>| s.map_or("-".into(), |s| format!("{:.3}", s.median));
+    let metric = |s: Option<Spread>| s.map_or("-".into(), |s| format!("{:.3}", s.median));
     let row = |b: &AtBound, name: &str, r: &Reliability| {
-        let figures = [r.distance, r.transition_kl, r.reward_difference, r.reward_error, r.consistency];
-        std::iter::once(format!("{}{name}", bound(d, b))).chain(figures.map(figure)).collect::<Vec<_>>()
+        let metrics = [r.distance, r.transition_kl, r.reward_difference, r.reward_error, r.consistency];
+        std::iter::once(format!("{}{name}", bound(d, b))).chain(metrics.map(metric)).collect::<Vec<_>>()
     };
     let rows = d.bounds_of_y.iter().flat_map(|b| {
         let rejected = b.outliers.as_ref().map(|r| row(b, ", rejected", r));

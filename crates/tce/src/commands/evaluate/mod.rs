@@ -1,7 +1,7 @@
 //! `tce evaluate`.
 
 #[cfg(feature = "video")]
-mod film;
+mod video;
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_run::error::{Error, Result};
 #[cfg(feature = "video")]
 use tce_zoo::actors::evaluate_recorded;
-use tce_zoo::actors::{Arena, Evaluation, evaluate, load_policy};
+use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate, load_policy};
 
 use crate::output::{Output, mark_best, table};
 
@@ -36,7 +36,7 @@ pub struct Evaluate {
     seed: u64,
     #[cfg(feature = "video")]
     #[command(flatten)]
-    film: film::FilmArgs,
+    video: video::VideoArgs,
 }
 
 #[derive(Serialize)]
@@ -47,7 +47,7 @@ struct Evaluated {
     evaluation: Evaluation,
     #[cfg(feature = "video")]
     #[serde(skip_serializing_if = "Option::is_none")]
-    video: Option<film::Filmed>,
+    video: Option<video::VideoReport>,
 }
 
 impl Evaluate {
@@ -60,24 +60,32 @@ impl Evaluate {
         let (agent, shift) = self.env;
         let arena = Arena::new(agent, shift, ScoreTable::default());
         #[cfg(feature = "video")]
-        let studio = self.film.studio(&self.policies)?;
+        let writer = self.video.writer(&self.policies)?;
         let policies: Vec<_> = self.policies.iter().map(|p| load_policy(p, agent)).collect::<tce_zoo::Result<_>>()?;
         #[cfg(feature = "video")]
-        if let Some(studio) = studio {
+        if let Some(writer) = writer {
             let roll = |arena, episodes| {
                 let streams = Streams::new(self.seed);
-                Ok(evaluate_recorded(&policies[0], arena, episodes, streams, !self.sample, interrupted)?)
+                Ok(evaluate_recorded(
+                    &policies[0],
+                    arena,
+                    episodes,
+                    streams,
+                    Actions::mean_if(!self.sample),
+                    interrupted,
+                )?)
             };
-            let (evaluation, video) = self.film.film(studio, arena, roll, self.episodes)?;
+            let (evaluation, video) = self.video.record(writer, arena, roll, self.episodes)?;
             let environment = format!("{agent}-{shift}");
-            let film = Evaluated { policy: self.policies[0].clone(), environment, evaluation, video: Some(video) };
-            output.print(&[film], |all| render(all));
+            let video = Evaluated { policy: self.policies[0].clone(), environment, evaluation, video: Some(video) };
+            output.print(&[video], |all| render(all));
             return Ok(());
         }
         let mut all = Vec::new();
         for (path, policy) in self.policies.iter().zip(&policies) {
             let streams = Streams::new(self.seed);
-            let evaluation = evaluate(policy, arena, self.episodes, streams, !self.sample, interrupted)?;
+            let evaluation =
+                evaluate(policy, arena, self.episodes, streams, Actions::mean_if(!self.sample), interrupted)?;
             all.push(Evaluated {
                 policy: path.clone(),
                 environment: format!("{agent}-{shift}"),

@@ -8,11 +8,11 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
 use tce_base::interrupted;
 use tce_nn::Device;
+use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
-use tce_run::processor::Processor;
 use tce_run::sweep::local::Share;
 use tce_run::sweep::slurm::{Array, Submission};
-use tce_run::sweep::{Kind, Manifest, Sweep};
+use tce_run::sweep::{Check, Kind, Manifest, Sweep};
 
 use crate::output::{Output, fit, table};
 
@@ -124,11 +124,11 @@ pub struct Gather {
 
 impl SweepCommand {
     /// Runs the command.
-    pub fn run(self, output: Output, save_every: f64, processor: Processor) -> Result<()> {
+    pub fn run(self, output: Output, save_every: f64, device: DeviceKind) -> Result<()> {
         match self {
             SweepCommand::Plan(args) => args.run(output),
-            SweepCommand::Launch(args) => args.run(output, save_every, processor),
-            SweepCommand::RunOne(args) => args.run(output, &processor.device()?),
+            SweepCommand::Launch(args) => args.run(output, save_every, device),
+            SweepCommand::RunOne(args) => args.run(output, &device.device()?),
             SweepCommand::Status(args) => args.run(output),
             SweepCommand::Gather(args) => args.run(output),
         }
@@ -141,7 +141,7 @@ struct Planned {
     source: usize,
     target: usize,
     distances: usize,
-    expand: usize,
+    augment: usize,
     run: usize,
 }
 
@@ -154,7 +154,7 @@ impl Plan {
             source: count(Kind::Source),
             target: count(Kind::Target),
             distances: count(Kind::Distances),
-            expand: count(Kind::Expand),
+            augment: count(Kind::Augment),
             run: count(Kind::Run),
             directory,
         };
@@ -173,7 +173,7 @@ impl Plan {
                 ("source data", p.source),
                 ("target data", p.target),
                 ("distances", p.distances),
-                ("generated rows", p.expand),
+                ("generated rows", p.augment),
                 ("runs", p.run),
             ];
             let text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
@@ -189,13 +189,13 @@ struct Submitted {
 }
 
 impl Launch {
-    fn run(self, output: Output, save_every: f64, processor: Processor) -> Result<()> {
+    fn run(self, output: Output, save_every: f64, device: DeviceKind) -> Result<()> {
         if self.threads_each == 0 || self.workers == Some(0) || self.pack == 0 {
             return Err(Error::Usage("--workers, --threads-each and --pack must be at least 1".into()));
         }
         let sweep = Sweep::open(&self.directory)?;
         if !self.dry_run {
-            for what in sweep.take_back_damaged(self.verify)? {
+            for what in sweep.take_back_damaged(if self.verify { Check::Content } else { Check::Existence })? {
                 tce_base::note!("to be done again: {what}");
             }
         }
@@ -205,7 +205,7 @@ impl Launch {
                     pack: self.pack,
                     threads: self.threads_each,
                     save_every,
-                    processor,
+                    device,
                     grace: self.grace,
                     arguments: self.sbatch,
                     dry_run: self.dry_run,
@@ -235,9 +235,9 @@ impl Launch {
                 }
                 let cores = std::thread::available_parallelism().map_or(1, usize::from);
                 // Several programs on one GPU take each other's time.
-                let fitting = if processor == Processor::Cpu { (cores / self.threads_each).max(1) } else { 1 };
+                let fitting = if device == DeviceKind::Cpu { (cores / self.threads_each).max(1) } else { 1 };
                 let workers = self.workers.unwrap_or(fitting);
-                let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every, processor };
+                let share = Share { workers, threads: self.threads_each, retries: self.retries, save_every, device };
                 let failed = sweep.launch_here(share)?;
                 let status = sweep.status()?;
                 output.print(&status, render::status);
@@ -306,7 +306,7 @@ impl StatusArgs {
             let until = std::time::Instant::now() + Duration::from_secs_f64(self.every.clamp(0.1, 3600.0));
             while std::time::Instant::now() < until {
                 if interrupted() {
-                    return Err(Error::Interrupted);
+                    return Err(Error::interrupted());
                 }
                 std::thread::sleep(Duration::from_millis(50));
             }

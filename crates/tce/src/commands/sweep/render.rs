@@ -17,7 +17,7 @@ pub fn status(status: &Status) -> String {
         Kind::Source => "source data",
         Kind::Target => "target data",
         Kind::Distances => "distances",
-        Kind::Expand => "generated rows",
+        Kind::Augment => "generated rows",
         Kind::Run => "runs",
     };
     let rows = status.kinds.iter().map(|(k, (done, all))| [word(k).to_owned(), format!("{done}/{all}")]);
@@ -90,15 +90,15 @@ pub fn gathered(gathered: &Gathered) -> String {
 
 /// For every method that is no baseline: on how many tasks it is above and below the best baseline, and where by more than seeds do.
 fn sentences(tasks: &[&str], methods: &[&str], cells: &BTreeMap<(&str, &str), Vec<f64>>) -> Vec<String> {
-    // Without floors there is nothing to be above of.
-    let floor = |method: &str| Variant::FLOORS.iter().any(|f| method.split(' ').next() == Some(f.name().as_str()));
+    // Without baselines there is nothing to be above of.
+    let baseline = |method: &str| Variant::BASELINES.iter().any(|f| method.split(' ').next() == Some(f.name()));
     let of = |method: &str| {
         Tally::of(tasks.iter().map(|task| {
             let scored =
-                |m: &str| cells.get(&(*task, m)).filter(|s| !s.is_empty()).map(|s| Scored::new(m, floor(m), s));
-            let floors: Vec<Scored> = methods.iter().filter(|m| floor(m)).filter_map(|m| scored(m)).collect();
-            (scored(method), floors)
+                |m: &str| cells.get(&(*task, m)).filter(|s| !s.is_empty()).map(|s| Scored::new(m, baseline(m), s));
+            let baselines: Vec<Scored> = methods.iter().filter(|m| baseline(m)).filter_map(|m| scored(m)).collect();
+            (scored(method), baselines)
         }))
     };
-    methods.iter().filter(|m| !floor(m)).filter_map(|m| of(m).map(|tally| tally.sentence(m))).collect()
+    methods.iter().filter(|m| !baseline(m)).filter_map(|m| of(m).map(|tally| tally.sentence(m))).collect()
 }

@@ -29,7 +29,7 @@ pub struct Generated {
 }
 
 /// Generated tables, one per member, and where they are.
-pub struct Expansion {
+pub struct Augmentation {
     /// The tables.
     pub tables: Vec<Arc<Transitions>>,
     /// A score per row, where the rows have any ([`super::single_stage`]).
@@ -40,7 +40,7 @@ pub struct Expansion {
     pub stage: Stage,
 }
 
-impl Expansion {
+impl Augmentation {
     /// Puts the files into `attempt`, too; returns their names.
     ///
     /// # Errors

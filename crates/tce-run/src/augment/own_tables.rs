@@ -6,10 +6,10 @@ use std::path::Path;
 use tce_data::Transitions;
 use tce_nn::Device;
 
+use crate::augment::{Generated, augment_rows};
 use crate::config::Config;
 use crate::course::Course;
 use crate::error::Result;
-use crate::expand::{Generated, expand};
 use crate::inputs::Inputs;
 
 /// Generated rows of one seed, and what they were made of.
@@ -33,7 +33,7 @@ impl Augmented {
         let mut course = Course::new(format!("{}x{}", dims.0, dims.1), 1, device, cache);
         course.generating(config);
         course.plan();
-        let expansion = expand(inputs, config, &[seed], cache, device)?;
+        let augmentation = augment_rows(inputs, config, &[seed], cache, device)?;
         let attributes = BTreeMap::from([
             ("source_sha256".to_owned(), inputs.source.as_ref().map_or_else(String::new, |s| s.hash.clone())),
             ("target_sha256".to_owned(), inputs.target.hash.clone()),
@@ -41,8 +41,8 @@ impl Augmented {
             ("config".to_owned(), config.to_toml()),
             ("program".to_owned(), tce_base::PROGRAM.to_owned()),
         ]);
-        let generated = inputs.in_own_units(&expansion.tables[0]);
-        Ok(Self { generated, report: expansion.reports[0].clone(), attributes })
+        let generated = inputs.in_own_units(&augmentation.tables[0]);
+        Ok(Self { generated, report: augmentation.reports[0].clone(), attributes })
     }
 
     /// The rows of `target`, then the generated ones; the second column, `origin`, is 0 for a target row and 1 for a generated one.

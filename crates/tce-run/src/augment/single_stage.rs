@@ -14,10 +14,10 @@ use tce_data::{DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, d
 use tce_diffusion::{Process, Sampler, ScoreModel, Target, TrainConfig};
 use tce_nn::{Device, NamedParameters, cpu};
 
-use super::expansion::{Expansion, Generated};
+use super::augmentation::{Augmentation, Generated};
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::kept::Kept;
 use crate::stage::Stage;
 
@@ -32,7 +32,8 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
         options: &'a DensityOptions,
     }
     let file = "scores.safetensors";
-    let stage = Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(true), options }, &cpu())?;
+    let stage =
+        Stage::open(root, "stages/source-scores", &Spec { inputs: inputs.spec(Domains::Both), options }, &cpu())?;
     if let Some(scale) = stage.summary::<DensityScale>()? {
         let path = stage.file(file);
         let mut loaded = NamedParameters::load(&path)?;
@@ -80,7 +81,7 @@ fn train(
         scores: Option<&'a DensityOptions>,
     }
     let spec = Spec {
-        inputs: inputs.spec(scored.is_some()),
+        inputs: inputs.spec(Domains::with_source(scored.is_some())),
         seeds,
         kind,
         rows: if scored.is_some() { "source" } else { "target" },
@@ -110,7 +111,13 @@ fn train(
 }
 
 /// Generated tables of SynthER (`mixture.generated` synther) or DmC, one per seed, from their stage if they are there.
-pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
+pub fn augment_rows(
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    device: &Device,
+) -> Result<Augmentation> {
     #[derive(Serialize)]
     struct Spec {
         network: String,
@@ -118,12 +125,12 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         rows: usize,
         guidance: Option<GuidanceConfig>,
     }
-    let (own, kind) = (&config.joint, config.mixture.generated);
+    let (own, kind) = (&config.single_stage, config.mixture.generated);
     let scored = match kind {
         GeneratedRows::Dmc => Some(scores(inputs, &own.scores, root)?),
         _ => None,
     };
-    tce_base::begin_step("joint network");
+    tce_base::begin_step("single-stage network");
     let (network, place) = train(inputs, kind, own, scored.as_ref(), seeds, root, device)?;
     let guidance = scored.as_ref().map(|_| own.guidance.clone());
     let spec = Spec { network: place.name(), sampler: own.sampler, rows: own.rows, guidance };
@@ -168,7 +175,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     read(stage, reports, scored.is_some())
 }
 
-fn read(stage: Stage, reports: Vec<Generated>, scored: bool) -> Result<Expansion> {
+fn read(stage: Stage, reports: Vec<Generated>, scored: bool) -> Result<Augmentation> {
     let (mut tables, mut scores) = (Vec::new(), Vec::new());
     for report in &reports {
         let columns = if scored { vec![SCORE.to_owned()] } else { Vec::new() };
@@ -176,5 +183,5 @@ fn read(stage: Stage, reports: Vec<Generated>, scored: bool) -> Result<Expansion
         tables.push(Arc::new(loaded.transitions));
         scores.push(loaded.columns.remove(SCORE).map(Arc::new));
     }
-    Ok(Expansion { tables, scores, reports, stage })
+    Ok(Augmentation { tables, scores, reports, stage })
 }

@@ -21,15 +21,16 @@ use tce_sim::terminal_rule;
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::inputs::Inputs;
-use crate::judge::Judge;
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::stage::{Attempt, Stage};
 
-mod expansion;
+mod augmentation;
 mod labels;
 mod networks;
+pub mod own_tables;
 pub mod single_stage;
 
-pub use expansion::{Expansion, Generated};
+pub use augmentation::{Augmentation, Generated};
 pub use labels::label_models;
 use labels::terminals;
 pub use networks::networks;
@@ -42,10 +43,16 @@ pub fn finisher<'a>(units: &'a Units, models: &'a LabelModels, config: &'a Confi
 }
 
 /// The generated rows that `config.mixture` asks for, made or taken from their stage.
-pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
+pub fn augment_rows(
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    device: &Device,
+) -> Result<Augmentation> {
     match config.mixture.generated {
         GeneratedRows::Tce => two_stages(inputs, config, seeds, root, device),
-        GeneratedRows::Synther | GeneratedRows::Dmc => single_stage::expand(inputs, config, seeds, root, device),
+        GeneratedRows::Synther | GeneratedRows::Dmc => single_stage::augment_rows(inputs, config, seeds, root, device),
         GeneratedRows::None => Err(Error::Usage(
             "mixture.generated: found \"none\", expected \"tce\", \"synther\" or \"dmc\": there is nothing to generate"
                 .into(),
@@ -55,7 +62,7 @@ pub fn expand(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
 
 /// What the observations of both domains respect.
 fn support(inputs: &Inputs) -> Support {
-    let tables: Vec<_> = std::iter::once(&inputs.target).chain(&inputs.source).map(|t| &t.rows).collect();
+    let tables: Vec<_> = std::iter::once(&inputs.target).chain(&inputs.source).map(|t| &*t.rows).collect();
     let support = support_of(&tables);
     support.describe().iter().for_each(|finding| tce_base::note!("generated rows respect: {finding}"));
     support
@@ -78,22 +85,22 @@ struct Spec<'a> {
     terminal: Terminal,
 }
 
-/// Runs, or takes from its stage, TCE's whole expansion.
-fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Expansion> {
+/// Runs, or takes from its stage, TCE's whole augmentation.
+fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Augmentation> {
     let (generator, place, _) = networks(inputs, config, seeds, root, device)?;
     let (models, labels, label_errors) = label_models(inputs, &config.labels, seeds, root, device)?;
     let rows = match config.generator.rows {
         0 => ((1.0 - config.mixture.lambda) * inputs.source_rows()?.len() as f64).round() as usize,
         rows => rows,
     };
-    let judge = match config.filter.by_dynamics() {
-        true => Some(Judge::train(inputs, &config.dynamics, root, device)?),
+    let evaluator = match config.filter.by_dynamics() {
+        true => Some(OffPolicyEvaluator::train(inputs, &config.dynamics, root, device)?),
         false => None,
     };
     let spec = Spec {
         networks: place.name(),
         labels: labels.name(),
-        dynamics: judge.as_ref().map(|j| j.stage.name()),
+        dynamics: evaluator.as_ref().map(|j| j.stage.name()),
         sampler: config.generator.sampler,
         y_max: config.generator.y_max,
         rows,
@@ -112,19 +119,19 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
         None => {
             let attempt = stage.attempt()?;
             let finisher = finisher(&generator.units, &models, config, inputs);
-            let finished = sampled(&generator, &finisher, judge.as_ref(), (inputs, config, seeds, rows), &attempt)?;
+            let finished = sampled(&generator, &finisher, evaluator.as_ref(), (inputs, config, seeds, rows), &attempt)?;
             write(finished, &spec, seeds, &label_errors, attempt)?
         }
     };
     let scores = vec![None; tables.len()];
-    Ok(Expansion { tables, scores, reports, stage })
+    Ok(Augmentation { tables, scores, reports, stage })
 }
 
 /// `rows` rows for every seed, sampled, filtered and labelled.
 fn sampled(
     generator: &Generator,
     finisher: &Finisher,
-    judge: Option<&Judge>,
+    evaluator: Option<&OffPolicyEvaluator>,
     (inputs, config, seeds, rows): (&Inputs, &Config, &[u64], usize),
     attempt: &Attempt,
 ) -> Result<Vec<Labelled>> {
@@ -137,9 +144,9 @@ fn sampled(
     let per_member = rows * generator.units.live.len();
     let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
     let mut finished = finisher.finish(&pairs)?;
-    if let Some(judge) = judge {
+    if let Some(evaluator) = evaluator {
         for labelled in &mut finished {
-            let keep = judge.possible(&labelled.transitions, config.filter.margin);
+            let keep = evaluator.possible(&labelled.transitions, config.filter.margin);
             if keep.is_empty() {
                 return Err(everything_rejected(rows, &config.filter).into());
             }

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Keeps the scores of sweeps and runs under bench/rivals.json and prints them as a table.
+"""Keeps the scores of sweeps and runs under bench/prior-methods.json and prints them as a table.
 
-    tce sweep gather runs/sweeps/rivals --partial
-    python3 bench/rivals.py runs/sweeps/rivals        # or without a folder: the table alone
+    tce sweep gather runs/sweeps/prior-methods --partial
+    python3 bench/prior_methods.py runs/sweeps/prior-methods        # or without a folder: the table alone
     tce --json run TASK --variant bc --seeds 20 --set learner.steps=50_000 > bc.json
-    python3 bench/rivals.py bc.json                   # with --steps and --processor where the run's folder is on another machine
+    python3 bench/prior_methods.py bc.json                   # with --steps and --processor where the run's folder is on another machine
 
 A sweep's folder is large and belongs to one machine; what it found is small. Runs of the same task, method, seed, updates, kind
 of observations and device take the place of those that are there.
@@ -18,7 +18,7 @@ import random
 import tomllib
 from statistics import mean, stdev
 
-KEPT = pathlib.Path(__file__).with_name("rivals.json")
+KEPT = pathlib.Path(__file__).with_name("prior-methods.json")
 TASKS = ["halfcheetah", "hopper", "walker2d", "ant"]
 
 

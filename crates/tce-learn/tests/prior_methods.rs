@@ -1,4 +1,4 @@
-//! The rivals and the deterministic actor-critics, end to end on a corridor.
+//! Prior methods and the deterministic actor-critics, end to end on a corridor.
 
 mod common;
 
@@ -62,11 +62,11 @@ fn actor() -> ActorConfig {
 
 fn iql() -> IqlConfig {
     let (hidden, actor) = (small(), actor());
-    IqlConfig { hidden, discount: 0.9, critic_lr: 3e-3, polyak: 0.05, temperature: 10.0, actor, ..IqlConfig::default() }
+    IqlConfig { hidden, discount: 0.9, critic_lr: 3e-3, polyak: 0.05, temperature: 10.0, actor, ..IqlConfig::paper() }
 }
 
 fn cvae(steps: u64) -> CvaeConfig {
-    CvaeConfig { hidden: small(), steps, ..CvaeConfig::default() }
+    CvaeConfig { hidden: small(), steps, ..CvaeConfig::paper() }
 }
 
 const METHODS: [&str; 7] = ["dara", "srpo", "igdf", "otdf", "bosa", "td3-bc", "rebrac"];
@@ -89,7 +89,7 @@ fn method(name: &str, mode: Mode, buffer: &Buffer, steps: u64) -> Box<dyn Policy
         }
         "otdf" => {
             let config = OtdfConfig { mode, beta_reg: 0.01, ..OtdfConfig::default() };
-            let constants = RegulariserConfig { cvae: cvae(300), ..RegulariserConfig::default() };
+            let constants = RegulariserConfig { cvae: cvae(300), ..RegulariserConfig::paper() };
             let kind = RegulariserKind::Otdf;
             let regulariser = Regulariser::prepare(kind, buffer, &constants, Place::NONE, d).unwrap().unwrap();
             Box::new(Otdf::new(buffer, &config, &iql, regulariser, steps, d).unwrap())

@@ -47,8 +47,8 @@ fn a_training_in_two_pieces_ends_with_the_bytes_of_one_in_one_piece() {
 
     // The policy is one like any other.
     let policy = place.join("policy.safetensors");
-    let judged = tce_json(dir.path(), &["evaluate", policy.to_str().unwrap(), "--env", "hopper", "--episodes", "2"]);
-    assert_eq!(judged[0]["returns"].as_array().unwrap().len(), 2);
+    let evaluated = tce_json(dir.path(), &["evaluate", policy.to_str().unwrap(), "--env", "hopper", "--episodes", "2"]);
+    assert_eq!(evaluated[0]["returns"].as_array().unwrap().len(), 2);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! `tce judge`.
+//! `tce compare`.
 
 use std::path::PathBuf;
 
@@ -8,14 +8,14 @@ use tce_learn::{DynamicsConfig, FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
 use tce_run::error::{Error, Result};
 use tce_run::inputs::Inputs;
-use tce_run::judge::{Judge, Judged};
+use tce_run::off_policy_evaluation::{OffPolicyEstimate, OffPolicyEvaluator};
 use tce_run::own::Own;
 
 use crate::output::{Output, table};
 
-/// Arguments of `judge`.
+/// Arguments of `compare`.
 #[derive(Debug, Args)]
-pub struct JudgeArgs {
+pub struct CompareArgs {
     /// The policies to compare.
     #[arg(required = true, value_name = "POLICY")]
     policies: Vec<PathBuf>,
@@ -51,12 +51,12 @@ struct Report {
 struct Line {
     policy: PathBuf,
     #[serde(flatten)]
-    judged: Judged,
+    estimate: OffPolicyEstimate,
     #[serde(skip_serializing_if = "Option::is_none")]
     fitted_q: Option<FittedValue>,
 }
 
-impl JudgeArgs {
+impl CompareArgs {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
         let inputs = Inputs::of_files(self.source.as_deref(), &self.target, None, &self.own)?;
@@ -75,19 +75,19 @@ impl JudgeArgs {
         };
         let policies = self.policies.iter().map(load).collect::<Result<Vec<_>>>()?;
         let config = DynamicsConfig { steps: self.dynamics_steps, ..DynamicsConfig::default() };
-        let judge = Judge::train(&inputs, &config, &self.cache, device)?;
+        let evaluator = OffPolicyEvaluator::train(&inputs, &config, &self.cache, device)?;
         let fitted_q = FittedQConfig { steps: self.fitted_q_steps, ..FittedQConfig::default() };
         let values = match fitted_q.steps {
             0 => vec![None; policies.len()],
-            _ => judge.values(&policies, &fitted_q, device)?.into_iter().map(Some).collect(),
+            _ => evaluator.values(&policies, &fitted_q, device)?.into_iter().map(Some).collect(),
         };
         let lines = self.policies.iter().zip(&policies).zip(values);
         let lines = lines.map(|((path, policy), fitted_q)| {
-            Ok(Line { policy: path.clone(), judged: judge.judge(policy)?, fitted_q })
+            Ok(Line { policy: path.clone(), estimate: evaluator.evaluate(policy)?, fitted_q })
         });
         let report = Report {
-            held_out: [judge.held_out_error(0.5), judge.held_out_error(0.95)],
-            behaviour_value: judge.behaviour_value(&fitted_q),
+            held_out: [evaluator.held_out_error(0.5), evaluator.held_out_error(0.95)],
+            behaviour_value: evaluator.behaviour_value(&fitted_q),
             policies: lines.collect::<Result<Vec<_>>>()?,
         };
         output.print(&report, render);
@@ -97,7 +97,7 @@ impl JudgeArgs {
 
 fn render(report: &Report) -> String {
     let rows = report.policies.iter().map(|l| {
-        let j = &l.judged;
+        let j = &l.estimate;
         [
             l.policy.display().to_string(),
             format!("{:.0} ± {:.0}", j.imagined_return, j.standard_error),

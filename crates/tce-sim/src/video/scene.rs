@@ -15,7 +15,7 @@ use super::solid::{Paint, Solid};
 const POINTS: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
 /// Where the light comes from: above, before and to the left.
 const LIGHT: Vec3 = [-0.35, -0.55, 0.9];
-/// Steps of light on a surface. Few, so that a film gets by with the colours of a GIF.
+/// Steps of light on a surface. Few, so that a video gets by with the colours of a GIF.
 const SHADES: usize = 7;
 /// Steps in which the ground fades into the sky.
 const FADES: usize = 16;

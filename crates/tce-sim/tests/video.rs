@@ -1,9 +1,9 @@
-//! Films: the episode that was evaluated, the same pixels always, and what a viewer must be able to tell.
+//! Videos: the episode that was evaluated, the same pixels always, and what a viewer must be able to tell.
 
 use rayon::prelude::*;
 use tce_base::Streams;
 use tce_data::{Agent, Shift};
-use tce_sim::film::{Colour, Film, FilmOptions, Picture};
+use tce_sim::video::{Colour, Picture, Video, VideoOptions};
 use tce_sim::{EPISODE_LIMIT, Ending, Recording, UniformActor, evaluate, evaluate_recorded};
 
 const SIZE: [usize; 2] = [240, 180];
@@ -12,8 +12,8 @@ fn record(agent: Agent, shift: Shift, seed: u64) -> Recording {
     evaluate_recorded(agent, shift, &UniformActor, 1, Streams::new(seed), || false).unwrap().1
 }
 
-fn film(recordings: Vec<Recording>) -> Film {
-    Film::new(recordings, FilmOptions { size: SIZE, ..FilmOptions::default() }).unwrap()
+fn video(recordings: Vec<Recording>) -> Video {
+    Video::new(recordings, VideoOptions { size: SIZE, ..VideoOptions::default() }).unwrap()
 }
 
 /// The columns of one panel.
@@ -53,24 +53,24 @@ fn time_runs_as_it_does_in_the_simulator() {
     let length = hopper.length();
     assert!(length < 200, "random hopping ends soon");
     // 8 ms a step: every fifth step makes 25 pictures a second; 25 more for the last second.
-    let real = film(vec![hopper.clone()]);
+    let real = video(vec![hopper.clone()]);
     assert_eq!((real.stride(), real.frames(), real.size()), (5, length.div_ceil(5) + 1 + 25, SIZE));
     assert!((real.interval() - 0.04).abs() < 1e-12);
     assert_eq!(real.steps(), length);
-    let with = |seconds, speed| Film::new(vec![hopper.clone()], FilmOptions { size: SIZE, seconds, speed }).unwrap();
+    let with = |seconds, speed| Video::new(vec![hopper.clone()], VideoOptions { size: SIZE, seconds, speed }).unwrap();
     // A fifth of the speed: every step; five pictures is all there is room for.
     let slow = with(0.2, 0.2);
     assert_eq!((slow.stride(), slow.frames(), slow.steps()), (1, 5, 4));
     assert_eq!(with(10.0, 4.0).stride(), 20);
     // HalfCheetah and Ant have 50 ms a step: every step a picture.
-    let ant = film(vec![record(Agent::Ant, Shift::Source, 1)]);
+    let ant = video(vec![record(Agent::Ant, Shift::Source, 1)]);
     assert_eq!((ant.stride(), ant.frames().min(200)), (1, ant.frames()));
     assert!((ant.interval() - 0.05).abs() < 1e-12);
 }
 
 #[test]
 fn the_same_pixels_in_any_order_at_any_number_of_threads() {
-    let make = || film(vec![record(Agent::Walker2d, Shift::Source, 3), record(Agent::Walker2d, Shift::Morph, 3)]);
+    let make = || video(vec![record(Agent::Walker2d, Shift::Source, 3), record(Agent::Walker2d, Shift::Morph, 3)]);
     let (one, other) = (make(), make());
     let forwards: Vec<Picture> = (0..one.frames()).map(|k| one.draw(k)).collect();
     let parallel: Vec<Picture> = (0..other.frames()).into_par_iter().map(|k| other.draw(k)).collect();
@@ -86,10 +86,10 @@ fn an_episode_that_is_over_stays_on_its_last_picture() {
     some.sort_by_key(Recording::length);
     let (short, long) = (some.swap_remove(0), some.pop().unwrap());
     let end = short.length().div_ceil(5);
-    let film = film(vec![short, long]);
-    let last = film.frames() - 1;
+    let video = video(vec![short, long]);
+    let last = video.frames() - 1;
     assert!(end + 1 < last - 25, "they differ by some pictures");
-    let [running, over, late, finis] = [end - 1, end, end + 1, last].map(|k| film.draw(k));
+    let [running, over, late, finis] = [end - 1, end, end + 1, last].map(|k| video.draw(k));
     assert!(panel(&running, 0) != panel(&over, 0));
     assert!(panel(&over, 0) == panel(&late, 0) && panel(&over, 0) == panel(&finis, 0));
     assert!(panel(&over, 1) != panel(&late, 1), "the other goes on");
@@ -102,7 +102,7 @@ fn the_accent_is_seen_in_the_changed_robot_only() {
         (Agent::HalfCheetah, Shift::Kinematic, true),
         (Agent::Walker2d, Shift::Gravity, false),
     ] {
-        let first = film(vec![record(agent, Shift::Source, 4), record(agent, shift, 4)]).draw(0);
+        let first = video(vec![record(agent, Shift::Source, 4), record(agent, shift, 4)]).draw(0);
         assert_eq!(accents(&panel(&first, 0)), 0, "{agent}");
         let changed = panel(&first, 1);
         // The legend lies in the lowest rows; another gravity is only told there.

@@ -12,7 +12,7 @@ use tce_nn::Device;
 use super::labels::label_models;
 use crate::config::Config;
 use crate::error::Result;
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::kept::{Kept, cycle_file};
 use crate::stage::Stage;
 
@@ -20,7 +20,7 @@ use crate::stage::Stage;
 #[derive(Serialize)]
 struct Spec<'a> {
     inputs: InputSpec,
-    /// The models by whose actions q_tran is judged.
+    /// The models whose actions measure q_tran.
     #[serde(skip_serializing_if = "Option::is_none")]
     labels: Option<String>,
     seeds: &'a [u64],
@@ -51,13 +51,13 @@ pub fn networks(
 ) -> Result<(Generator, Stage, Trained)> {
     let g = &config.generator;
     // Inferred actions tell when q_tran is done.
-    let judge = match g.transition_steps {
+    let action_models = match g.transition_steps {
         Length::Auto => Some(label_models(inputs, &config.labels, seeds, root, device)?),
         Length::Steps(_) => None,
     };
     let spec = Spec {
-        inputs: inputs.spec_imitated(g.source_states, &config.target),
-        labels: judge.as_ref().map(|(_, stage, _)| stage.name()),
+        inputs: inputs.spec_imitated(Domains::with_source(g.source_states), &config.target),
+        labels: action_models.as_ref().map(|(_, stage, _)| stage.name()),
         seeds,
         process: g.process,
         target: g.target,
@@ -89,7 +89,7 @@ pub fn networks(
     let work = Work { seeds, device, keeper: &kept };
     let source = if g.source_states { Some(inputs.source_rows()?) } else { None };
     let target = inputs.imitated(&config.target);
-    let (generator, mut trained) = Generator::fit(source, &target, g, judge.as_ref().map(|j| &j.0), &work)?;
+    let (generator, mut trained) = Generator::fit(source, &target, g, action_models.as_ref().map(|j| &j.0), &work)?;
     trained.seconds = started.elapsed().as_secs_f64();
     generator.state.save(&attempt.file(files[0]))?;
     generator.transition.save(&attempt.file(files[1]))?;

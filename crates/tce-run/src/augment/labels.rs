@@ -1,7 +1,6 @@
 //! The stage of the label models.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use serde::Serialize;
 use tce_augment::config::{LabelsConfig, Terminal};
@@ -10,7 +9,7 @@ use tce_learn::{LabelConfig, LabelErrors, LabelModels, Learner};
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::Result;
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
 /// The inverse dynamics and reward models of a whole population: trained on the target rows, or taken from their stage.
@@ -29,11 +28,11 @@ pub fn label_models(
     }
     let learn_terminals = terminals(inputs, config) == Terminal::Learned;
     let labels = LabelConfig { learn_terminals, ..config.training.clone() };
-    let spec = Spec { inputs: inputs.spec(learn_terminals), seeds, labels: &labels };
+    let spec = Spec { inputs: inputs.spec(Domains::with_source(learn_terminals)), seeds, labels: &labels };
     tce_base::begin_step("label models");
     let stage = Stage::open(root, "stages/labels", &spec, device)?;
-    let source = inputs.source.as_ref().filter(|_| learn_terminals).map(|s| Arc::new(s.rows.clone()));
-    let members = label_members(Arc::new(inputs.target.rows.clone()), source, seeds);
+    let source = inputs.source.as_ref().filter(|_| learn_terminals).map(|s| s.rows.clone());
+    let members = label_members(inputs.target.rows.clone(), source, seeds);
     let file = "labels.safetensors";
     let path = stage.file(file);
     if let Some(errors) = stage.summary::<Vec<Option<LabelErrors>>>()? {

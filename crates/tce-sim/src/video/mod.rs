@@ -1,4 +1,4 @@
-//! Films of recorded episodes, side by side. Everything is drawn here, on the CPU, from the coordinates: no OpenGL, no screen, and
+//! Videos of recorded episodes, side by side. Everything is drawn here, on the CPU, from the coordinates: no OpenGL, no screen, and
 //! the same recordings give the same pixels.
 
 mod camera;
@@ -24,7 +24,7 @@ pub use picture::{Colour, Picture};
 
 /// Seconds that a picture is shown, about: 25 pictures a second.
 const INTERVAL: f64 = 0.04;
-/// Seconds for which the last picture stays, so that it can be read before the film begins anew.
+/// Seconds for which the last picture stays, so that it can be read before the video begins anew.
 const HOLD: f64 = 1.0;
 /// Pixels between two panels.
 const GAP: usize = 2;
@@ -33,25 +33,25 @@ const INK: Colour = [38, 44, 56];
 const FAINT: Colour = [92, 100, 114];
 const ALARM: Colour = [196, 40, 40];
 
-/// How a film is made.
+/// How a video is made.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FilmOptions {
+pub struct VideoOptions {
     /// Width and height of a panel, pixels.
     pub size: [usize; 2],
     /// Longest duration, s.
     pub seconds: f64,
-    /// Simulated seconds in one second of the film.
+    /// Simulated seconds in one second of the video.
     pub speed: f64,
 }
 
-impl Default for FilmOptions {
+impl Default for VideoOptions {
     fn default() -> Self {
         Self { size: [480, 360], seconds: 10.0, speed: 1.0 }
     }
 }
 
-/// A film, ready to be drawn picture by picture, in any order.
-pub struct Film {
+/// A video, ready to be drawn picture by picture, in any order.
+pub struct Video {
     panels: Vec<Panel>,
     size: [usize; 2],
     frames: usize,
@@ -68,16 +68,16 @@ struct Panel {
     legend: Vec<String>,
 }
 
-impl Film {
-    /// A film of one robot's episodes, from left to right. It ends a second after the longest of them, or after
-    /// [`FilmOptions::seconds`].
+impl Video {
+    /// A video of one robot's episodes, from left to right. It ends a second after the longest of them, or after
+    /// [`VideoOptions::seconds`].
     ///
     /// # Errors
     /// If a model cannot be compiled, which it was for the recording.
     ///
     /// # Panics
     /// Without recordings.
-    pub fn new(recordings: Vec<Recording>, options: FilmOptions) -> Result<Self, SimError> {
+    pub fn new(recordings: Vec<Recording>, options: VideoOptions) -> Result<Self, SimError> {
         let first = &recordings[0];
         let dt = seconds_per_step(first.agent, &*compiled(first.agent, first.shift)?);
         let stride = ((options.speed * INTERVAL / dt).round() as usize).max(1);

@@ -1,16 +1,17 @@
-//! Which of several policies to put on the robot, told from the two data sets alone.
+//! Off-policy evaluation: estimates of policies from the two data sets alone, without a simulator.
 //!
 //! A policy is tried in a learned model of the target's dynamics ([`tce_learn::dynamics`]: both domains' rows, the domain as an
 //! input). An imagined episode begins at a target state, keeps to one network of the ensemble, and ends where the network says that
 //! the state is terminal, where the state has left everything that either robot has been seen in, or after as many steps as the longest
 //! target episode has.
 //!
-//! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks say anything. What
-//! it does after that is worth the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early must not pay.
-//! Halting where the data end is MOReL's (Kidambi et al. 2020). It is shown and decides nothing: on HalfCheetah, kinematic, policies of 686,
+//! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks are
+//! not to be trusted. Each later step counts the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early
+//! must not pay.
+//! Halting where the data end is MOReL's (Kidambi et al. 2020). It is shown only and decides nothing: on HalfCheetah, kinematic, policies of 686,
 //! 3130 and 3766 have 926, 1985 and 906 (bench/expansion.md).
 //!
-//! | figure | meaning |
+//! | metric | meaning |
 //! |---|---|
 //! | imagined return | mean return of the imagined episodes |
 //! | supported return | the same until the episode is far from the target's states |
@@ -34,7 +35,7 @@ use tce_learn::{
 use tce_nn::{Device, NamedParameters};
 
 use crate::error::{Error, Result};
-use crate::inputs::{InputSpec, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
 /// States from which a policy is tried, for each network of the ensemble.
@@ -49,8 +50,8 @@ const WORST: f64 = 0.01;
 /// A state further outside of everything seen than this share of a column's range ends an imagined episode.
 const MARGIN: f32 = 0.25;
 
-/// The trained ensemble, and how it does on target rows that it has not seen.
-pub struct Judge {
+/// The trained ensemble, with its errors on target rows that it has not seen.
+pub struct OffPolicyEvaluator {
     /// The ensemble.
     pub dynamics: Dynamics,
     /// Errors of the held-out target rows, ascending, in steps.
@@ -66,13 +67,13 @@ pub struct Judge {
     /// The units of the policies' actions, where they are not the box.
     actions: Option<ActionRange>,
     spacing: f64,
-    /// The reward of a step that nobody knows anything of.
+    /// The reward of a step outside of the models' range.
     worst: f64,
 }
 
-/// What a policy does in the learned model.
+/// The estimates of a policy in the learned model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judged {
+pub struct OffPolicyEstimate {
     /// Mean return of the imagined episodes.
     pub imagined_return: f64,
     /// Standard error of it, over the networks and the starts.
@@ -89,7 +90,7 @@ pub struct Judged {
     pub returns: Vec<f64>,
 }
 
-impl Judge {
+impl OffPolicyEvaluator {
     /// Trains the ensemble on the target's and, if there are any, the source's rows, or takes it from its stage.
     pub fn train(inputs: &Inputs, config: &DynamicsConfig, root: &Path, device: &Device) -> Result<Self> {
         #[derive(Serialize)]
@@ -98,12 +99,12 @@ impl Judge {
             config: &'a DynamicsConfig,
             held_out: f64,
         }
-        let spec = Spec { inputs: inputs.spec(inputs.source.is_some()), config, held_out: HELD_OUT };
+        let spec = Spec { inputs: inputs.spec(Domains::Both), config, held_out: HELD_OUT };
         tce_base::begin_step("learned dynamics");
         let stage = Stage::open(root, "stages/dynamics", &spec, device)?;
         let target = &inputs.target.rows;
         let (kept, apart) = hold_out_runs(target.len(), HELD_OUT);
-        let source = inputs.source.as_ref().map(|s| Arc::new(s.rows.clone()));
+        let source = inputs.source.as_ref().map(|s| s.rows.clone());
         let scale = even_standardizer(target, source.as_deref());
         let training = Arc::new(target.select(&kept));
         let mut dynamics = Dynamics::new(training, source.clone(), scale, Streams::new(0), config, device)?;
@@ -117,7 +118,7 @@ impl Judge {
             None => {
                 let attempt = stage.attempt()?;
                 let trained = train_dynamics(dynamics, &mut attempt.checkpoints("dynamics")?, device)?;
-                dynamics = trained.ok_or(Error::Interrupted)?;
+                dynamics = trained.ok_or_else(Error::interrupted)?;
                 let mut errors = dynamics.errors(&target.select(&apart), Domain::Target);
                 errors.sort_by(f64::total_cmp);
                 dynamics.state().save(&attempt.file(file))?;
@@ -125,7 +126,7 @@ impl Judge {
                 errors
             }
         };
-        let tables: Vec<&Transitions> = std::iter::once(target).chain(source.as_deref()).collect();
+        let tables: Vec<&Transitions> = std::iter::once(&**target).chain(source.as_deref()).collect();
         let (low, high) = bounds(&tables);
         let episodes = target.episodes();
         let limit = episodes.iter().map(|e| e.end - e.start).max().unwrap_or(1);
@@ -134,10 +135,10 @@ impl Judge {
             held_out,
             stage,
             root: root.to_owned(),
-            inputs: inputs.spec(false),
+            inputs: inputs.spec(Domains::Target),
             spacing: spacing(target),
             worst: worst_reward(target),
-            target: Arc::new(target.clone()),
+            target: target.clone(),
             low,
             high,
             limit,
@@ -158,8 +159,8 @@ impl Judge {
         self.held_out.get((last * quantile) as usize).copied().unwrap_or(f64::NAN)
     }
 
-    /// Tries a policy.
-    pub fn judge(&self, policy: &Policy) -> Result<Judged> {
+    /// Evaluates a policy in the learned model.
+    pub fn evaluate(&self, policy: &Policy) -> Result<OffPolicyEstimate> {
         let t = &self.target;
         let starts = starts(t);
         let networks = self.dynamics.members();
@@ -222,7 +223,7 @@ impl Judge {
         let n = returns.len() as f64;
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
-        Ok(Judged {
+        Ok(OffPolicyEstimate {
             imagined_return: mean,
             standard_error: std / n.sqrt(),
             supported_return: mean_std(&supported).0,
@@ -234,7 +235,7 @@ impl Judge {
     }
 }
 
-impl Judge {
+impl OffPolicyEvaluator {
     /// The returns of episodes until they leave what the models know: where they `left` its bounds, or where one of the states that they
     /// `passed` is far from the target's, whichever comes first. `distances` are those of the passed states, in the order of the steps.
     fn counted(
@@ -268,7 +269,7 @@ impl Judge {
         actions
     }
 
-    /// What the policies are worth by fitted Q evaluation on the target's rows, as one stage.
+    /// Estimates the policies' values by fitted Q evaluation on the target's rows, as one stage.
     ///
     /// # Errors
     /// If a file cannot be read or written, or the user interrupts.
@@ -300,7 +301,7 @@ impl Judge {
         let attempt = stage.attempt()?;
         let mut checkpoints = attempt.checkpoints("fitted-q")?;
         let values = fitted_q(t, &starts, &actions, config, Streams::new(0), &mut checkpoints, device)?;
-        let values = values.ok_or(Error::Interrupted)?;
+        let values = values.ok_or_else(Error::interrupted)?;
         attempt.finish(&[], &values)?;
         Ok(values)
     }

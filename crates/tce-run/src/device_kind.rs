@@ -11,7 +11,7 @@ use crate::error::Result;
 /// A kind of device. Simulation, nearest neighbours, transport and files are the CPU's in any case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Processor {
+pub enum DeviceKind {
     /// The CPU: the same seed gives the same bytes, at any number of threads.
     #[default]
     Cpu,
@@ -20,7 +20,7 @@ pub enum Processor {
     Vulkan,
 }
 
-impl Processor {
+impl DeviceKind {
     /// Adds the device to what decides a result, unless it is the CPU.
     pub fn sign(self, spec: &mut serde_json::Value) {
         if self != Self::Cpu {
@@ -40,13 +40,13 @@ impl Processor {
     }
 }
 
-impl From<&Device> for Processor {
+impl From<&Device> for DeviceKind {
     fn from(device: &Device) -> Self {
         if is_cpu(device) { Self::Cpu } else { Self::Vulkan }
     }
 }
 
-impl fmt::Display for Processor {
+impl fmt::Display for DeviceKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Cpu => "cpu",
