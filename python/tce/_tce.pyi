@@ -17,17 +17,7 @@ class Table:
     @staticmethod
     def load(path: Path, robot: Any) -> Table: ...
     @staticmethod
-    def of_arrays(
-        name: Path,
-        observations: _Floats,
-        actions: _Floats,
-        rewards: _Floats,
-        next_observations: _Floats | None,
-        terminals: _Flags,
-        timeouts: _Flags | None,
-        further: Mapping[str, _Floats],
-        robot: Any,
-    ) -> Table: ...
+    def of_arrays(name: Path, arrays: Mapping[str, Any], robot: Any) -> Table: ...
     @staticmethod
     def of_state(
         observations: _Floats,
@@ -83,13 +73,9 @@ class Env:
     def step(self, action: _Floats) -> tuple[_Floats, float, bool, bool]: ...
     def state(self) -> tuple[list[float], list[float]]: ...
 
-def augment(
-    source: Table, target: Table, settings: Any, robot: Any, seed: int, cache: Path, progress: _Progress
-) -> tuple[Table, str]: ...
+def augment(source: Table, target: Table, call: Mapping[str, Any], progress: _Progress) -> tuple[Table, str]: ...
 def train(
-    target: Table,
-    extra: Table | None,
-    source: Table | None,
+    tables: tuple[Table, Table | None, Table | None],
     wanted: Any,
     settings: Any,
     robot: Any,

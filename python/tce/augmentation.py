@@ -103,9 +103,7 @@ class Augmented:
 
 
 def _run(source: Transitions, target: Transitions, call: dict[str, Any], progress: Progress) -> tuple[Any, str]:
-    return _tce.augment(
-        source._table, target._table, call["settings"], call["robot"], call["seed"], call["cache"], chosen(progress)
-    )
+    return _tce.augment(source._table, target._table, call, chosen(progress))
 
 
 def augment(

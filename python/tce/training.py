@@ -166,7 +166,7 @@ def train(
     bars, call = chosen(progress)
     reader = MetricsReader(folder / "metrics.jsonl", callback)
     attended = (bars, call if callback is None else reader.beside(call))
-    text = _tce.train(*tables, wanted, Settings(preset, config), robot, folder, attended)
+    text = _tce.train(tables, wanted, Settings(preset, config), robot, folder, attended)
     reader.read()
     return TrainingRun(json.loads(text), folder, keep)
 

@@ -341,17 +341,16 @@ def _of_mapping(source: Mapping[str, Any], robot: Robot, name: str) -> Transitio
         array = None if key in used else np.asarray(source[key])
         if array is not None and array.dtype.kind in "fiub" and array.shape in ((rows,), (rows, 1)):
             further[str(key)] = np.ascontiguousarray(array.reshape(-1), dtype=np.float32)
-    table = _tce.Table.of_arrays(
-        Path(name),
-        numbers(observations, 2),
-        numbers(actions, 2),
-        numbers(rewards, 1),
-        None if following is None else numbers(following, 2),
-        flags(terminals),
-        None if timeouts is None else flags(timeouts),
-        further,
-        robot,
-    )
+    arrays = {
+        "observations": numbers(observations, 2),
+        "actions": numbers(actions, 2),
+        "rewards": numbers(rewards, 1),
+        "next_observations": None if following is None else numbers(following, 2),
+        "terminals": flags(terminals),
+        "timeouts": None if timeouts is None else flags(timeouts),
+        "further": further,
+    }
+    table = _tce.Table.of_arrays(Path(name), arrays, robot)
     return Transitions(table)
 
 

@@ -13,25 +13,31 @@ use crate::settings::{Robot, Settings};
 use crate::table::Table;
 use crate::work::{Progress, attended};
 
-/// Generated rows for `target`, and the report on them as JSON with the attributes of a file of them.
-#[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "as the command has options")]
-pub fn augment(
-    py: Python<'_>,
-    source: &Table,
-    target: &Table,
+/// What decides the rows, besides the tables, and where the networks are kept.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Call {
     settings: Settings,
     robot: Robot,
     seed: u64,
     cache: PathBuf,
+}
+
+/// Generated rows for `target`, and the report on them as JSON with the attributes of a file of them.
+#[pyfunction]
+pub fn augment(
+    py: Python<'_>,
+    source: &Table,
+    target: &Table,
+    call: Call,
     progress: Progress,
 ) -> PyResult<(Table, String)> {
+    let Call { settings, robot, seed, cache } = call;
     let (config, own): (Config, Own) = (settings.config().or_raise(py)?, robot.own().or_raise(py)?);
     let (source, target) = (source.rows.clone(), target.rows.clone());
     let augmented = attended(py, progress, move || {
         tce_base::ensure_folder(&cache)?;
-        let inputs = Inputs::of_rows(Some(source), target, None, &own)?;
-        let inputs = inputs.with_target_rows(config.target.rows);
+        let inputs = Inputs::of_rows(Some(source), target, None, &own)?.with_target_rows(config.target.rows);
         Augmented::new(&inputs, &config, seed, &cache, &tce_nn::cpu())
     })?;
     let report = serde_json::json!({ "report": augmented.report, "attributes": augmented.attributes });

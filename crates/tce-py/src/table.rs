@@ -61,6 +61,19 @@ fn copied<T: Element + Copy>(array: &PyReadonlyArray1<'_, T>) -> Vec<T> {
     array.as_array().iter().copied().collect()
 }
 
+/// Columns by D4RL's names, of a dict.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Arrays<'py> {
+    observations: PyReadonlyArray2<'py, f32>,
+    actions: PyReadonlyArray2<'py, f32>,
+    rewards: PyReadonlyArray1<'py, f32>,
+    next_observations: Option<PyReadonlyArray2<'py, f32>>,
+    terminals: PyReadonlyArray1<'py, bool>,
+    timeouts: Option<PyReadonlyArray1<'py, bool>>,
+    further: BTreeMap<String, PyReadonlyArray1<'py, f32>>,
+}
+
 #[pymethods]
 impl Table {
     /// Reads a file in any layout that the program knows, with all its further columns.
@@ -73,23 +86,12 @@ impl Table {
 
     /// Checks arrays as a file with the same columns is checked.
     #[staticmethod]
-    #[expect(clippy::too_many_arguments, reason = "a column each")]
-    fn of_arrays(
-        py: Python<'_>,
-        name: PathBuf,
-        observations: PyReadonlyArray2<'_, f32>,
-        actions: PyReadonlyArray2<'_, f32>,
-        rewards: PyReadonlyArray1<'_, f32>,
-        next_observations: Option<PyReadonlyArray2<'_, f32>>,
-        terminals: PyReadonlyArray1<'_, bool>,
-        timeouts: Option<PyReadonlyArray1<'_, bool>>,
-        further: BTreeMap<String, PyReadonlyArray1<'_, f32>>,
-        robot: Robot,
-    ) -> PyResult<Self> {
+    fn of_arrays(py: Python<'_>, name: PathBuf, arrays: Arrays<'_>, robot: Robot) -> PyResult<Self> {
         let flat = |array: &PyReadonlyArray2<'_, f32>| -> Vec<f32> {
             array.as_slice().map_or_else(|_| array.as_array().iter().copied().collect(), <[f32]>::to_vec)
         };
-        if let Some(next) = next_observations.as_ref().filter(|next| next.shape()[1] != observations.shape()[1]) {
+        let (observations, next) = (&arrays.observations, arrays.next_observations.as_ref());
+        if let Some(next) = next.filter(|next| next.shape()[1] != observations.shape()[1]) {
             let (found, expected) = (next.shape()[1], observations.shape()[1]);
             let message = format!(
                 "{}: field `next_observations`: found {found} columns; expected {expected} columns, as in `observations`",
@@ -99,14 +101,14 @@ impl Table {
         }
         let columns = Columns {
             obs_dim: observations.shape()[1],
-            act_dim: actions.shape()[1],
-            observations: flat(&observations),
-            actions: flat(&actions),
-            rewards: copied(&rewards),
-            next_observations: next_observations.as_ref().map(flat),
-            terminals: copied(&terminals),
-            timeouts: timeouts.as_ref().map(copied),
-            further: further.iter().map(|(name, column)| (name.clone(), copied(column))).collect(),
+            act_dim: arrays.actions.shape()[1],
+            observations: flat(observations),
+            actions: flat(&arrays.actions),
+            rewards: copied(&arrays.rewards),
+            next_observations: next.map(flat),
+            terminals: copied(&arrays.terminals),
+            timeouts: arrays.timeouts.as_ref().map(copied),
+            further: arrays.further.iter().map(|(name, column)| (name.clone(), copied(column))).collect(),
         };
         let options = robot.own().or_raise(py)?.load_options();
         py.detach(|| from_columns(columns, &name, &options)).map(Self::loaded).or_raise(py)

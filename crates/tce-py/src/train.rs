@@ -22,20 +22,22 @@ pub struct Wanted {
     compare: bool,
 }
 
-/// Trains policies on `target`, and `extra` rows if there are any, into the folder `out`. The summary as JSON.
+/// Target, extra and source rows.
+type Tables<'py> = (PyRef<'py, Table>, Option<PyRef<'py, Table>>, Option<PyRef<'py, Table>>);
+
+/// Trains policies on the tables `target`, and `extra` if there is one, into the folder `out`; `source` is for the comparison. The summary
+/// as JSON.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "as the command has options")]
 pub fn train(
     py: Python<'_>,
-    target: &Table,
-    extra: Option<PyRef<'_, Table>>,
-    source: Option<PyRef<'_, Table>>,
+    tables: Tables<'_>,
     wanted: Wanted,
     settings: Settings,
     robot: Robot,
     out: PathBuf,
     progress: Progress,
 ) -> PyResult<String> {
+    let (target, extra, source) = tables;
     let config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
     let own = robot.own().or_raise(py)?;
     let seeds = counted(wanted.first_seed, wanted.seeds).or_raise(py)?;
