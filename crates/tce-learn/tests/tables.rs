@@ -47,7 +47,7 @@ fn agrees(cell: &str, found: &Value) -> Option<bool> {
 
 #[test]
 fn tables_tell_the_values() {
-    let mut compared = 0;
+    let (mut compared, mut wrong) = (0, Vec::new());
     for (file, text, config) in tables! {
         "algorithms/iql.rs": IqlConfig::paper();
         "algorithms/bc.rs": BcConfig::default();
@@ -76,14 +76,21 @@ fn tables_tell_the_values() {
             let names: Vec<&str> = fields.split('`').skip(1).step_by(2).collect();
             let several = names.len() > 1;
             for (k, name) in names.iter().enumerate() {
+                // `std`² tells a square.
+                if fields.contains(&format!("`{name}`²")) {
+                    continue;
+                }
                 let Some(found) = config.get(name) else { continue };
                 let part = if several { told.split(", ").nth(k).unwrap_or_default() } else { told };
                 if let Some(same) = agrees(part, found) {
-                    assert!(same, "{file}: `{name}` is {found}, the table says {told}");
                     compared += 1;
+                    if !same {
+                        wrong.push(format!("{file}: `{name}` is {found}, the table says {told}"));
+                    }
                 }
             }
         }
     }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert!(compared > 60, "{compared} values were compared");
 }

@@ -38,7 +38,8 @@ impl Augmented {
             ("source_sha256".to_owned(), inputs.source.as_ref().map_or_else(String::new, |s| s.hash.clone())),
             ("target_sha256".to_owned(), inputs.target.hash.clone()),
             ("seed".to_owned(), seed.to_string()),
-            ("config".to_owned(), config.to_toml()),
+            // The names of keys: equal settings give equal bytes in every version.
+            ("config".to_owned(), config.to_keyed_toml()),
             ("program".to_owned(), tce_base::PROGRAM.to_owned()),
         ]);
         let generated = inputs.in_own_units(&augmentation.tables[0]);
