@@ -14,6 +14,7 @@ use tce_run::own::{DataFormat, Writing};
 
 use crate::errors::{Raise, exception};
 use crate::settings::Robot;
+use crate::work::aside;
 
 /// Rows (s, a, r, s', terminal, time-out) and what reading them found.
 #[pyclass(frozen, module = "tce._tce")]
@@ -81,7 +82,7 @@ impl Table {
     fn load(py: Python<'_>, path: PathBuf, robot: Robot) -> PyResult<Self> {
         let own = robot.own().or_raise(py)?;
         let options = LoadOptions { all_columns: true, ..own.load_options() };
-        py.detach(|| tce_data::load(&path, &options)).map(Self::loaded).or_raise(py)
+        aside(py, || tce_data::load(&path, &options))?.map(Self::loaded).or_raise(py)
     }
 
     /// Checks arrays as a file with the same columns is checked.
@@ -111,7 +112,7 @@ impl Table {
             further: arrays.further.iter().map(|(name, column)| (name.clone(), copied(column))).collect(),
         };
         let options = robot.own().or_raise(py)?.load_options();
-        py.detach(|| from_columns(columns, &name, &options)).map(Self::loaded).or_raise(py)
+        aside(py, || from_columns(columns, &name, &options))?.map(Self::loaded).or_raise(py)
     }
 
     /// Rows as another process had them, which were checked there.
@@ -187,21 +188,21 @@ impl Table {
         }
         let pick = |values: &Vec<f32>| indices.iter().map(|&i| values[i]).collect();
         let columns = self.columns.iter().map(|(name, values)| (name.clone(), pick(values))).collect();
-        let rows = py.detach(|| Arc::new(self.rows.select(&indices)));
+        let rows = aside(py, || Arc::new(self.rows.select(&indices)))?;
         Ok(Self { rows, columns, report: None })
     }
 
     /// What `tce data check` notices, as JSON.
     fn check(&self, py: Python<'_>, robot: Robot) -> PyResult<String> {
         let agent = robot.own().or_raise(py)?.agent();
-        let check = py.detach(|| tce_data::check(&self.rows, agent));
+        let check = aside(py, || tce_data::check(&self.rows, agent))?;
         Ok(serde_json::to_string(&check).expect("plain data"))
     }
 
     /// What `tce data inspect` tells, as JSON.
     fn inspect(&self, py: Python<'_>, robot: Robot) -> PyResult<String> {
         let limit = robot.own().or_raise(py)?.limit();
-        let inspection = py.detach(|| tce_data::inspect(&self.rows, limit));
+        let inspection = aside(py, || tce_data::inspect(&self.rows, limit))?;
         Ok(serde_json::to_string(&inspection).expect("plain data"))
     }
 
@@ -225,6 +226,6 @@ impl Table {
         }
         let columns: Vec<(&str, &[f32])> = self.columns.iter().map(|(k, v)| (k.as_str(), v.as_slice())).collect();
         let writing = Writing { format, id, force: overwrite };
-        py.detach(|| writing.write(&path, &self.rows, None, &attributes, &columns)).or_raise(py)
+        aside(py, || writing.write(&path, &self.rows, None, &attributes, &columns))?.or_raise(py)
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::time::Duration;
 use std::{process, thread};
 
+use pyo3::marker::Ungil;
 use pyo3::prelude::*;
 use tce_run::Error;
 
@@ -43,6 +44,12 @@ fn ensure_not_forked(py: Python<'_>) -> PyResult<()> {
 enum Message {
     Note(String),
     Done,
+}
+
+/// Short work on all cores, without Python's lock.
+pub fn aside<T: Ungil>(py: Python<'_>, work: impl FnOnce() -> T + Ungil) -> PyResult<T> {
+    ensure_not_forked(py)?;
+    Ok(py.detach(work))
 }
 
 /// Waits until no other long call is under way.
