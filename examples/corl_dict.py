@@ -1,4 +1,4 @@
-"""TCE's rows as D4RL's dict, as CORL's scripts take it, and behaviour cloning on it in plain PyTorch. About ten minutes on two cores.
+"""TCE's rows as D4RL's dict, as CORL's scripts take it, and behaviour cloning on it in plain PyTorch. About a quarter of an hour on two cores.
 
     pip install . torch gymnasium
     python examples/corl_dict.py

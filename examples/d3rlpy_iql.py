@@ -1,4 +1,4 @@
-"""TCE's rows for a learner of d3rlpy: target and generated transitions of the arm, IQL of d3rlpy. About ten minutes on two cores.
+"""TCE's rows for a learner of d3rlpy: target and generated transitions of the arm, IQL of d3rlpy. About a quarter of an hour on two cores.
 
     pip install . d3rlpy gymnasium
     python examples/d3rlpy_iql.py

@@ -162,6 +162,11 @@ impl Table {
         self.complete.as_deref().unwrap_or(&self.rows)
     }
 
+    /// [`Self::complete`], shared.
+    pub(crate) fn all_rows(&self) -> Arc<Transitions> {
+        self.complete.as_ref().unwrap_or(&self.rows).clone()
+    }
+
     pub(crate) fn scale(&mut self, range: &ActionRange) {
         range.to_unit(&mut Arc::make_mut(&mut self.rows).actions);
         self.complete.iter_mut().for_each(|t| range.to_unit(&mut Arc::make_mut(t).actions));

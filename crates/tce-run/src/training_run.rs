@@ -149,7 +149,7 @@ impl TrainingRun<'_> {
         if let Some(choice) = inputs.choice(&self.config.target) {
             tce_base::note!("{}", choice.reason);
         }
-        let rows = |table: &Table| Arc::new(if complete { table.complete() } else { &table.rows }.clone());
+        let rows = |table: &Table| if complete { table.all_rows() } else { table.rows.clone() };
         let extra = inputs.extra.as_ref().map(rows);
         let row_scores = match &extra {
             Some(extra) => row_scores(self.config, &target, extra)?,

@@ -389,7 +389,7 @@ fn the_better_of_two_behaviours_is_learned() {
         assert!(output.status.success(), "{}", message(&output));
         (std::fs::read(dir.join(out).join("policy-seed0.safetensors")).unwrap(), message(&output))
     };
-    let (of_better, _) = policy("better.hdf5", "better", &[]);
+    let (of_better, _) = policy("better.hdf5", "better", &["--set", "target.trajectories=all"]);
     let (of_mixed, told) = policy("mixed.hdf5", "mixed", &[]);
     assert!(told.contains("learned from the better four (1600 of 3200 rows)"), "{told}");
     assert_eq!(of_mixed, of_better);
