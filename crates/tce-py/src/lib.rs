@@ -2,7 +2,7 @@
 //! front of it; nobody else is meant to call it.
 //!
 //! Arrays go in as float32 and bool, row-major, which the package sees to, and come out as views of the program's memory. Long calls
-//! release Python's lock, listen to Ctrl-C and end at a checkpoint ([`work`]). Reports are JSON text.
+//! release Python's lock, listen to Ctrl-C and end at a checkpoint (work.rs). Reports are JSON text.
 
 use pyo3::prelude::*;
 
