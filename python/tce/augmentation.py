@@ -60,24 +60,11 @@ class Augmented:
 
     def transitions(self) -> Transitions:
         """Target rows, then generated ones; ``extra_columns["origin"]`` is 0 and 1."""
-        target, generated = self.target, self.generated
-
-        def joined(name: str) -> npt.NDArray[Any]:
-            return np.concatenate([getattr(target, name), getattr(generated, name)])
-
-        terminals, timeouts, known = (joined(name) for name in ("terminals", "timeouts", "known"))
-        # The last episode of the target must not run on into the generated rows.
-        end = len(target) - 1
-        timeouts[end] |= not terminals[end]
-        columns = (joined(name) for name in ("observations", "actions", "rewards", "next_observations"))
-        observations, actions, rewards, following = columns
-        flags = [terminals, timeouts, known]
-        further = {"origin": self.origin()}
-        return Transitions(_tce.Table.of_state(observations, actions, rewards, following, flags, further, None))
+        return Transitions(self.target._table.joined(self.generated._table))
 
     def origin(self) -> npt.NDArray[np.float32]:
         """0 for each target row, then 1 for each generated one."""
-        return np.repeat(np.array([0, 1], np.float32), [len(self.target), len(self.generated)])
+        return self.transitions().extra_columns["origin"]
 
     def to_dict(self) -> dict[str, npt.NDArray[Any]]:
         """The columns of :meth:`transitions` by D4RL's names."""

@@ -125,15 +125,8 @@ class Policy:
 
         Standardisation and the actions' range are inside. Raises :class:`tce.Error` for a policy that remembers its episode.
         """
-        path = Path(path)
-        data = bytes(self._policy.onnx())
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            temporary.write_bytes(data)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return path
+        self._policy.save_onnx(Path(path))
+        return Path(path)
 
     def to_torch(self) -> Any:
         """A ``torch.nn.Module`` from observations (N, d_s) to mean actions (N, d_a). Needs ``torch``.

@@ -162,22 +162,13 @@ def train(
     )
     keep = tempfile.TemporaryDirectory(prefix="tce-") if out is None else None
     folder = Path(out if out is not None else keep.name)  # type: ignore[union-attr]
-    wanted = _Wanted(learner, top, seeds, seed, compare)
+    wanted = {"learner": learner, "top": top, "seeds": seeds, "first_seed": seed, "compare": compare}
     bars, call = chosen(progress)
     reader = MetricsReader(folder / "metrics.jsonl", callback)
     attended = (bars, call if callback is None else reader.beside(call))
     text = _tce.train(tables, wanted, Settings(preset, config), robot, folder, attended)
     reader.read()
     return TrainingRun(json.loads(text), folder, keep)
-
-
-class _Wanted:
-    def __init__(self, learner: str | None, top: float | None, seeds: int, first_seed: int, compare: bool) -> None:
-        self.learner = learner
-        self.top = top
-        self.seeds = seeds
-        self.first_seed = first_seed
-        self.compare = compare
 
 
 __all__ = ["Callback", "Extra", "TrainingRun", "Transitions", "train"]

@@ -35,8 +35,7 @@ pub struct Running {
 
 /// The running pieces of work, the oldest first: for a host that shows progress in its own way.
 pub fn running() -> Vec<Running> {
-    let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
-    running.retain(|(counter, _)| counter.strong_count() > 0);
+    let running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
     let tell = |(counter, unit): &(Weak<Counter>, &'static str)| {
         let counter = counter.upgrade()?;
         let (done, seconds) = (counter.done.load(Ordering::Relaxed), counter.started.elapsed().as_secs_f64());

@@ -9,6 +9,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use tce_base::{Rng, Streams};
 use tce_learn::{Memory, onnx};
+use tce_zoo::actors::read_policy;
 
 use crate::errors::Raise;
 
@@ -32,12 +33,7 @@ impl Policy {
     /// Reads a file, or an actor of the zoo (`zoo:NAME`).
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
-        let exhibit = tce_zoo::exhibits::Exhibit::at(&path).or_raise(py)?;
-        let policy = match exhibit {
-            Some(exhibit) => exhibit.policy().or_raise(py)?,
-            None => py.detach(|| tce_learn::Policy::load(&path)).or_raise(py)?,
-        };
-        Ok(Self { policy })
+        Ok(Self { policy: py.detach(|| read_policy(&path)).or_raise(py)? })
     }
 
     /// Writes a safetensors file, whole or not at all.
@@ -108,9 +104,9 @@ impl Policy {
         (parameters.tensors.into_iter().map(tensor).collect(), parameters.metadata.into_iter().collect())
     }
 
-    /// The bytes of an ONNX model.
-    fn onnx(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
-        onnx::model(&self.policy).or_raise(py)
+    /// Writes an ONNX model, whole or not at all.
+    fn save_onnx(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        onnx::save(&self.policy, &path).or_raise(py)
     }
 
     fn __reduce__<'py>(this: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, (Vec<u8>,))> {

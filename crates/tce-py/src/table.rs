@@ -10,6 +10,7 @@ use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyRea
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use tce_data::{Columns, LoadOptions, Loaded, Transitions, from_columns};
+use tce_run::augment::own_tables::joined;
 use tce_run::own::{DataFormat, Writing};
 
 use crate::errors::{Raise, exception};
@@ -58,6 +59,11 @@ fn matrix<'py>(owner: &Bound<'py, Table>, values: &[f32], dim: usize) -> Bound<'
     array.into_any()
 }
 
+/// A matrix, row by row.
+fn flat(array: &PyReadonlyArray2<'_, f32>) -> Vec<f32> {
+    array.as_slice().map_or_else(|_| array.as_array().iter().copied().collect(), <[f32]>::to_vec)
+}
+
 fn copied<T: Element + Copy>(array: &PyReadonlyArray1<'_, T>) -> Vec<T> {
     array.as_array().iter().copied().collect()
 }
@@ -88,9 +94,6 @@ impl Table {
     /// Checks arrays as a file with the same columns is checked.
     #[staticmethod]
     fn of_arrays(py: Python<'_>, name: PathBuf, arrays: Arrays<'_>, robot: Robot) -> PyResult<Self> {
-        let flat = |array: &PyReadonlyArray2<'_, f32>| -> Vec<f32> {
-            array.as_slice().map_or_else(|_| array.as_array().iter().copied().collect(), <[f32]>::to_vec)
-        };
         let (observations, next) = (&arrays.observations, arrays.next_observations.as_ref());
         if let Some(next) = next.filter(|next| next.shape()[1] != observations.shape()[1]) {
             let (found, expected) = (next.shape()[1], observations.shape()[1]);
@@ -130,10 +133,10 @@ impl Table {
         let rows = Transitions {
             obs_dim: observations.shape()[1],
             act_dim: actions.shape()[1],
-            observations: observations.as_array().iter().copied().collect(),
-            actions: actions.as_array().iter().copied().collect(),
+            observations: flat(&observations),
+            actions: flat(&actions),
             rewards: copied(&rewards),
-            next_observations: next_observations.as_array().iter().copied().collect(),
+            next_observations: flat(&next_observations),
             terminals,
             timeouts,
             known,
@@ -190,6 +193,13 @@ impl Table {
         let columns = self.columns.iter().map(|(name, values)| (name.clone(), pick(values))).collect();
         let rows = aside(py, || Arc::new(self.rows.select(&indices)))?;
         Ok(Self { rows, columns, report: None })
+    }
+
+    /// These rows, then `generated` ones, with the column `origin`, as `tce augment` writes them.
+    fn joined(&self, py: Python<'_>, generated: &Self) -> PyResult<Self> {
+        let (rows, origin) = aside(py, || joined(&self.rows, &generated.rows))?;
+        let columns = BTreeMap::from([("origin".to_owned(), origin)]);
+        Ok(Self { rows: Arc::new(rows), columns, report: None })
     }
 
     /// What `tce data check` notices, as JSON.

@@ -14,6 +14,7 @@ use crate::work::{Progress, attended};
 
 /// Which policies to train.
 #[derive(FromPyObject)]
+#[pyo3(from_item_all)]
 pub struct Wanted {
     learner: Option<String>,
     top: Option<f64>,

@@ -76,10 +76,10 @@ pub fn attended<T: Send>(
     ensure_not_forked(py)?;
     let _turn = turn(py)?;
     let (sender, messages) = channel();
-    let notes = Mutex::new(sender.clone());
-    let listener = move |text: &str| {
-        let _ = notes.lock().unwrap_or_else(PoisonError::into_inner).send(Message::Note(text.to_owned()));
-    };
+    // Waited for without Python's lock, which only what threads may share can be.
+    let messages = Mutex::new(messages);
+    let notes = sender.clone();
+    let listener = move |text: &str| drop(notes.send(Message::Note(text.to_owned())));
     tce_base::set_interrupted(false);
     tce_base::set_listener(Some(Box::new(listener)));
     tce_base::set_quiet(!progress.0);
@@ -107,6 +107,7 @@ pub fn attended<T: Send>(
     tce_base::end_course(if done { tce_base::LastStep::Done } else { tce_base::LastStep::BrokenOff });
     tce_base::set_interrupted(false);
     tce_base::set_listener(None);
+    let messages = messages.into_inner().unwrap_or_else(PoisonError::into_inner);
     let rest = messages.try_iter().try_for_each(|message| log(py, &message));
     match (result, stopped) {
         (Err(panic), _) => Err(exception(py, "Error", format!("a fault of the program: {}", words(&*panic)))),
@@ -118,22 +119,10 @@ pub fn attended<T: Send>(
     }
 }
 
-/// A tick: a note or the end wakes it before its time.
-fn attend(py: Python<'_>, messages: &Receiver<Message>, progress: &Progress) -> PyResult<()> {
-    // A receiver is not shared between threads, so it does not leave this one: the lock is released by sleeping without it.
-    let mut waited = Duration::ZERO;
-    loop {
-        match messages.try_recv() {
-            Ok(Message::Done) => return Ok(()),
-            Ok(note) => log(py, &note)?,
-            Err(_) if waited >= TICK => break,
-            Err(_) => {
-                let pause = Duration::from_millis(5);
-                py.detach(|| thread::sleep(pause));
-                waited += pause;
-            }
-        }
-    }
+/// Waits for a note or the end, at most a tick, and looks after everything.
+fn attend(py: Python<'_>, messages: &Mutex<Receiver<Message>>, progress: &Progress) -> PyResult<()> {
+    let message = py.detach(|| messages.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(TICK));
+    message.map_or(Ok(()), |message| log(py, &message))?;
     py.check_signals()?;
     if let Some(call) = &progress.1 {
         for r in tce_base::running() {

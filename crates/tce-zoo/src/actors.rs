@@ -59,12 +59,23 @@ impl Actor for PolicyActor {
     }
 }
 
-/// Loads a policy, from a file or as `zoo:NAME`, and checks that it is one for `agent`.
+/// Reads a policy, from a file or as `zoo:NAME`.
+///
+/// # Errors
+/// If there is none, or it is damaged.
+pub fn read_policy(path: &Path) -> Result<Policy> {
+    match Exhibit::at(path)? {
+        Some(exhibit) => exhibit.policy(),
+        None => Ok(Policy::load(path)?),
+    }
+}
+
+/// [`read_policy`], of one for `agent`.
+///
+/// # Errors
+/// As there, and if it has other dimensions.
 pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
-    let policy = match Exhibit::at(path)? {
-        Some(exhibit) => exhibit.policy()?,
-        None => Policy::load(path)?,
-    };
+    let policy = read_policy(path)?;
     let (found, expected) = (policy.dims(), agent.dims());
     if found != expected {
         return Err(Error::Failed(format!(

@@ -1,48 +1,23 @@
 //! Rows that are in memory: NumPy arrays, or whatever another program has.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::formats::Raw;
+use super::formats::{Columns, Raw};
 use super::load::{Loaded, finish};
 use super::options::LoadOptions;
 use super::successors::{fill_gaps, layout_of, told_gaps};
 use crate::{DataError, Problem};
-
-/// Columns as a file of D4RL's layout has them, row-major.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Columns {
-    /// State dimension.
-    pub obs_dim: usize,
-    /// Action dimension.
-    pub act_dim: usize,
-    /// s, `[N, obs_dim]`.
-    pub observations: Vec<f32>,
-    /// a, `[N, act_dim]`.
-    pub actions: Vec<f32>,
-    /// r, `[N]`.
-    pub rewards: Vec<f32>,
-    /// s', `[N, obs_dim]`; None: the next row's state.
-    pub next_observations: Option<Vec<f32>>,
-    /// Whether s' is absorbing, `[N]`.
-    pub terminals: Vec<bool>,
-    /// Whether the episode was cut after the row, `[N]`; None: it is found out.
-    pub timeouts: Option<Vec<bool>>,
-    /// Further columns, `[N]` each.
-    pub further: BTreeMap<String, Vec<f32>>,
-}
 
 /// Validates `columns` as [`load`](crate::load) does a file with the same ones, and puts right what it puts right; `name` is what messages
 /// call them.
 ///
 /// # Errors
 /// No rows or no columns, columns of different lengths, NaN or infinity, other dimensions than those asked for.
-pub fn from_columns(columns: Columns, name: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
-    let Columns { obs_dim, act_dim, observations, actions, rewards, mut next_observations, terminals, .. } = columns;
+pub fn from_columns(mut columns: Columns, name: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
+    let (obs_dim, act_dim, rows) = (columns.obs_dim, columns.act_dim, columns.rewards.len());
     let invalid = |problem, field: &str, found: String, expected: String, advice: &str| {
         Err(DataError::invalid(problem, name, field, found, expected, advice))
     };
-    let rows = rewards.len();
     if rows == 0 || obs_dim == 0 || act_dim == 0 {
         let field = if obs_dim == 0 {
             "observations"
@@ -55,11 +30,11 @@ pub fn from_columns(columns: Columns, name: &Path, options: &LoadOptions) -> Res
         return invalid(Problem::Empty, field, "an empty array".into(), expected, "Record more of this robot");
     }
     let mut sizes = vec![
-        ("observations", observations.len(), obs_dim),
-        ("actions", actions.len(), act_dim),
-        ("terminals", terminals.len(), 1),
+        ("observations", columns.observations.len(), obs_dim),
+        ("actions", columns.actions.len(), act_dim),
+        ("terminals", columns.terminals.len(), 1),
     ];
-    sizes.extend(next_observations.as_ref().map(|next| ("next_observations", next.len(), obs_dim)));
+    sizes.extend(columns.next_observations.as_ref().map(|next| ("next_observations", next.len(), obs_dim)));
     sizes.extend(columns.timeouts.as_ref().map(|t| ("timeouts", t.len(), 1)));
     sizes.extend(columns.further.iter().map(|(field, values)| (field.as_str(), values.len(), 1)));
     if let Some((field, len, dim)) = sizes.into_iter().find(|(_, len, dim)| *len != rows * dim) {
@@ -67,17 +42,19 @@ pub fn from_columns(columns: Columns, name: &Path, options: &LoadOptions) -> Res
         let expected = format!("{rows} rows, as in `rewards`");
         return invalid(Problem::RowCount, field, found, expected, "The arrays must have one row per transition");
     }
-    for (field, values, dim) in
-        [("observations", &observations, obs_dim), ("actions", &actions, act_dim), ("rewards", &rewards, 1)]
-    {
+    for (field, values, dim) in [
+        ("observations", &columns.observations, obs_dim),
+        ("actions", &columns.actions, act_dim),
+        ("rewards", &columns.rewards, 1),
+    ] {
         if let Some(at) = values.iter().position(|x| !x.is_finite()) {
             let found = format!("{} in row {}, column {}", values[at], at / dim, at % dim);
             return invalid(Problem::NonFinite, field, found, "finite numbers".into(), "Remove the row, or repair it");
         }
     }
     let (mut known, mut warnings) = (None, Vec::new());
-    if let Some(next) = &mut next_observations {
-        match fill_gaps(next, &observations, &terminals, &mut known) {
+    if let Some(next) = &mut columns.next_observations {
+        match fill_gaps(next, &columns.observations, &columns.terminals, &mut known) {
             Ok(gaps) => warnings.extend(told_gaps("next_observations", gaps)),
             Err(row) => {
                 let found = format!("a number that is not finite in row {row}, which is no terminal");
@@ -86,25 +63,14 @@ pub fn from_columns(columns: Columns, name: &Path, options: &LoadOptions) -> Res
             }
         }
     }
-    let raw = Raw {
-        layout: layout_of(next_observations.is_some(), columns.timeouts.is_some()),
-        obs_dim,
-        act_dim,
-        observations,
-        actions,
-        rewards,
-        next_observations,
-        terminals,
-        timeouts: columns.timeouts,
-        known,
-        columns: columns.further,
-        warnings,
-    };
-    finish(raw, name, options)
+    let layout = layout_of(columns.next_observations.is_some(), columns.timeouts.is_some());
+    finish(Raw { layout, columns, known, warnings }, name, options)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
 
     /// Two episodes of three rows; the state counts on within each.

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::formats::Raw;
+use super::formats::{Columns, Raw};
 use super::hdf5::{Column, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
@@ -162,8 +162,7 @@ impl Together {
     /// All of it, as a file's rows.
     pub fn raw(self, layout: Layout) -> Raw {
         let dim = |parts: &[(String, usize)]| parts.iter().map(|p| p.1).sum();
-        Raw {
-            layout,
+        let columns = Columns {
             obs_dim: dim(&self.obs),
             act_dim: dim(&self.act),
             observations: self.observations,
@@ -172,10 +171,9 @@ impl Together {
             next_observations: Some(self.next_observations),
             terminals: self.terminals,
             timeouts: Some(self.timeouts),
-            known: None,
-            columns: BTreeMap::new(),
-            warnings: self.warnings,
-        }
+            further: BTreeMap::new(),
+        };
+        Raw { layout, columns, known: None, warnings: self.warnings }
     }
 
     /// Notes what the columns of states and actions are, and refuses an episode with others than those before.

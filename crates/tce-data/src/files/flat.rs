@@ -11,7 +11,7 @@
 
 use std::collections::BTreeMap;
 
-use super::formats::{Format, Raw};
+use super::formats::{Columns, Format, Raw};
 use super::hdf5::{Column, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
@@ -125,8 +125,7 @@ impl Format for Flat {
             (true, Some(_), Some(_)) => Layout::Tce,
             _ => layout_of(stored.is_some(), timeout.is_some()),
         };
-        Ok(Raw {
-            layout,
+        let columns = Columns {
             obs_dim: observed.dim,
             act_dim: acted.dim,
             observations: observed.data,
@@ -135,10 +134,9 @@ impl Format for Flat {
             next_observations: stored.map(|c: Column| c.data),
             terminals: terminal,
             timeouts: timeout,
-            known,
-            columns,
-            warnings,
-        })
+            further: columns,
+        };
+        Ok(Raw { layout, columns, known, warnings })
     }
 }
 

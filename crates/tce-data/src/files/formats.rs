@@ -25,23 +25,35 @@ pub(super) trait Format: Sync {
     fn read(&self, file: &Hdf5, options: &LoadOptions) -> Result<Raw, DataError>;
 }
 
+/// Columns as a file of D4RL's layout has them, row-major; what every layout is read as.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Columns {
+    /// State dimension.
+    pub obs_dim: usize,
+    /// Action dimension.
+    pub act_dim: usize,
+    /// s, `[N, obs_dim]`.
+    pub observations: Vec<f32>,
+    /// a, `[N, act_dim]`.
+    pub actions: Vec<f32>,
+    /// r, `[N]`.
+    pub rewards: Vec<f32>,
+    /// s', `[N, obs_dim]`; None: the next row's state.
+    pub next_observations: Option<Vec<f32>>,
+    /// Whether s' is absorbing, `[N]`.
+    pub terminals: Vec<bool>,
+    /// Whether the episode was cut after the row, `[N]`; None: it is found out.
+    pub timeouts: Option<Vec<bool>>,
+    /// Further columns, `[N]` each.
+    pub further: BTreeMap<String, Vec<f32>>,
+}
+
 /// The rows of a file, as they stand there. All columns have one entry per row.
 pub(super) struct Raw {
     pub layout: Layout,
-    pub obs_dim: usize,
-    pub act_dim: usize,
-    pub observations: Vec<f32>,
-    pub actions: Vec<f32>,
-    pub rewards: Vec<f32>,
-    /// Stored successors, if there are any.
-    pub next_observations: Option<Vec<f32>>,
-    pub terminals: Vec<bool>,
-    /// Marks of time-outs, if there are any.
-    pub timeouts: Option<Vec<bool>>,
+    pub columns: Columns,
     /// Which successors are known, where the file says it.
     pub known: Option<Vec<bool>>,
-    /// Further columns that were asked for.
-    pub columns: BTreeMap<String, Vec<f32>>,
     /// What was read of the file in another way than by its plain names, and what was not read.
     pub warnings: Vec<String>,
 }
@@ -51,7 +63,9 @@ impl Raw {
     pub fn check_dims(&self, file: &Path, dims: Option<(usize, usize)>) -> Result<(), DataError> {
         let Some((o, a)) = dims else { return Ok(()) };
         let advice = "This is a file of another agent: choose the file, or the agent, that fits";
-        for (field, found, expected) in [("observations", self.obs_dim, o), ("actions", self.act_dim, a)] {
+        for (field, found, expected) in
+            [("observations", self.columns.obs_dim, o), ("actions", self.columns.act_dim, a)]
+        {
             if found != expected {
                 let (found, expected) = (format!("{found} columns"), format!("{expected} columns"));
                 return Err(DataError::invalid(Problem::Dimension, file, field, found, expected, advice));

@@ -48,17 +48,18 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
 /// Rows as they were read, put right: `path` is what messages call them.
 pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     raw.check_dims(path, options.dims)?;
-    let (rows, layout, mut columns, mut warnings) = (raw.rewards.len(), raw.layout, raw.columns, raw.warnings);
+    let Raw { layout, columns: read, known, mut warnings } = raw;
+    let (rows, mut columns) = (read.rewards.len(), read.further);
     let mut transitions = Transitions {
-        obs_dim: raw.obs_dim,
-        act_dim: raw.act_dim,
-        observations: raw.observations,
-        actions: raw.actions,
-        rewards: raw.rewards,
-        next_observations: raw.next_observations.unwrap_or_default(),
-        terminals: raw.terminals,
-        timeouts: raw.timeouts.unwrap_or_default(),
-        known: raw.known.unwrap_or_else(|| vec![true; rows]),
+        obs_dim: read.obs_dim,
+        act_dim: read.act_dim,
+        observations: read.observations,
+        actions: read.actions,
+        rewards: read.rewards,
+        next_observations: read.next_observations.unwrap_or_default(),
+        terminals: read.terminals,
+        timeouts: read.timeouts.unwrap_or_default(),
+        known: known.unwrap_or_else(|| vec![true; rows]),
     };
     let summary = match layout {
         Layout::Otdf | Layout::D4rl => settle(&mut transitions, &mut columns, options.step_limit, &mut warnings),

@@ -29,7 +29,8 @@ mod save_minari;
 mod steps;
 mod successors;
 
-pub use columns::{Columns, from_columns};
+pub use columns::from_columns;
+pub use formats::Columns;
 pub use load::{Loaded, load, read_attributes};
 pub use minari::main_file;
 pub use options::LoadOptions;

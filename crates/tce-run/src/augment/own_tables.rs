@@ -45,19 +45,19 @@ impl Augmented {
         let generated = inputs.in_own_units(&augmentation.tables[0]);
         Ok(Self { generated, report: augmentation.reports[0].clone(), attributes })
     }
+}
 
-    /// The rows of `target`, then the generated ones; the second column, `origin`, is 0 for a target row and 1 for a generated one.
-    pub fn behind(&self, target: &Transitions) -> (Transitions, Vec<f32>) {
-        let rows = target.len() + self.generated.len();
-        let mut all = Transitions::with_capacity(target.obs_dim, target.act_dim, rows);
-        all.extend(target);
-        // The last episode of the target must not run on into the generated rows.
-        if let (Some(timeout), Some(false)) = (all.timeouts.last_mut(), target.terminals.last()) {
-            *timeout = true;
-        }
-        all.extend(&self.generated);
-        let mut origin = vec![0.0; target.len()];
-        origin.resize(rows, 1.0);
-        (all, origin)
+/// The rows of `target`, then `generated` ones; the second column, `origin`, is 0 for a target row and 1 for a generated one.
+pub fn joined(target: &Transitions, generated: &Transitions) -> (Transitions, Vec<f32>) {
+    let rows = target.len() + generated.len();
+    let mut all = Transitions::with_capacity(target.obs_dim, target.act_dim, rows);
+    all.extend(target);
+    // The last episode of the target must not run on into the generated rows.
+    if let (Some(timeout), Some(false)) = (all.timeouts.last_mut(), target.terminals.last()) {
+        *timeout = true;
     }
+    all.extend(generated);
+    let mut origin = vec![0.0; target.len()];
+    origin.resize(rows, 1.0);
+    (all, origin)
 }

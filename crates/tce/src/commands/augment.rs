@@ -6,7 +6,7 @@ use clap::Args;
 use serde::Serialize;
 use tce_nn::Device;
 use tce_run::augment::Generated;
-use tce_run::augment::own_tables::Augmented;
+use tce_run::augment::own_tables::{Augmented, joined};
 use tce_run::error::Result;
 use tce_run::inputs::Inputs;
 use tce_run::layers::ConfigArgs;
@@ -62,8 +62,11 @@ impl Augment {
         let augmented = Augmented::new(&inputs, &config, self.seed, &self.cache, device)?;
         let target = &inputs.target_in_own_units();
         let (rows, origin) = match self.only_generated {
-            true => (augmented.generated.clone(), vec![1.0; augmented.generated.len()]),
-            false => augmented.behind(target),
+            true => {
+                let origin = vec![1.0; augmented.generated.len()];
+                (augmented.generated, origin)
+            }
+            false => joined(target, &augmented.generated),
         };
         self.writing.write(&self.out, &rows, inputs.actions.as_ref(), &augmented.attributes, &[("origin", &origin)])?;
         let written = if self.only_generated { 0 } else { target.len() };

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_learn::{Policy, onnx};
+use tce_learn::onnx;
 use tce_run::error::Result;
-use tce_zoo::exhibits::Exhibit;
+use tce_zoo::actors::read_policy;
 
 use crate::output::Output;
 
@@ -35,10 +35,7 @@ impl Export {
     pub fn run(self, output: Output) -> Result<()> {
         super::refuse::existing(&self.onnx, self.force)?;
         super::refuse::inputs_as_output(&self.onnx, &[&self.policy])?;
-        let policy = match Exhibit::at(&self.policy)? {
-            Some(exhibit) => exhibit.policy()?,
-            None => Policy::load(&self.policy)?,
-        };
+        let policy = read_policy(&self.policy)?;
         onnx::save(&policy, &self.onnx)?;
         let (observations, actions) = policy.dims();
         output.print(&Exported { onnx: self.onnx, observations, actions }, |e| {
