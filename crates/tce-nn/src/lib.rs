@@ -30,7 +30,7 @@ pub use dense::{dense, dense_composed};
 pub use layers::{Dense, LayerNorm, Mlp, MlpConfig};
 pub use norm::{layer_norm, layer_norm_composed};
 pub use params::{NamedParameters, NetworkError, moving_average, parameter_count};
-pub use probe::{instructions, product_rate};
+pub use probe::{instructions, machine, processor, product_rate};
 pub use stack::ResidualStack;
 pub use tensors::{Batch, cosine_decay, host, tensor};
 

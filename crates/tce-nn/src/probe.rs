@@ -34,3 +34,15 @@ pub fn instructions() -> &'static str {
         _ => "portable kernels",
     }
 }
+
+/// The processor's name, as the kernel tells it.
+pub fn processor() -> String {
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let line = info.lines().find(|l| l.starts_with("model name"));
+    line.and_then(|l| l.split(": ").nth(1)).unwrap_or("unknown").to_owned()
+}
+
+/// Processor and instruction set: what decides the bytes of a result besides its inputs.
+pub fn machine() -> String {
+    format!("{}, {}", processor(), instructions())
+}

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tce_base::{first_damaged, read_if_there, sha256_hex};
 
@@ -12,12 +13,15 @@ use crate::error::{ReportError, Result};
 const AGAIN: &str = "remove the run's folder and run it again";
 
 /// A finished run: one method on one task, one member per seed.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RunFolder {
     /// Where it is.
     pub directory: PathBuf,
     /// The program that made it.
     pub program: String,
+    /// The processor that it ran on; empty where nobody noted it.
+    #[serde(default)]
+    pub machine: String,
     /// One member each.
     pub members: Vec<Member>,
     /// Seconds from data to scores, without stages that were there already.
@@ -31,6 +35,7 @@ pub struct RunFolder {
     /// SHA-256 of its files.
     pub files: BTreeMap<String, String>,
     /// The configuration, as `config.toml` has it.
+    #[serde(skip)]
     pub config: String,
     /// The start of the configuration's SHA-256.
     pub config_hash: String,
@@ -39,11 +44,12 @@ pub struct RunFolder {
     /// What the run is keyed by in `spec.json`: SHA-256 of the data files, agent and shift.
     pub inputs: BTreeMap<String, String>,
     /// Figures during training, by member and by name.
+    #[serde(skip)]
     pub curves: Vec<Curves>,
 }
 
 /// One seed of a run.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Member {
     /// Its seed.
     pub seed: u64,
@@ -54,7 +60,8 @@ pub struct Member {
 }
 
 /// What an evaluation came to.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Verdict {
     /// The normalised score.
     Score(f64),
@@ -154,7 +161,7 @@ impl RunFolder {
         })?;
         let bad = |found: String| ReportError::field(&config_path, "(the whole file)", found, "TOML", AGAIN);
         let config = String::from_utf8(bytes).map_err(|e| bad(e.to_string()))?;
-        let config_hash = sha256_hex(with_old_names(&config).as_bytes())[..16].to_owned();
+        let config_hash = config_hash(&config);
         let table: toml::Table = config.parse().map_err(|e: toml::de::Error| bad(e.message().to_owned()))?;
 
         let spec_path = directory.join("spec.json");
@@ -165,6 +172,7 @@ impl RunFolder {
         Ok(Some(Self {
             directory: directory.to_owned(),
             program: done.get("/program", "the program's name", Value::as_str)?.to_owned(),
+            machine: done.root.pointer("/machine").and_then(Value::as_str).unwrap_or_default().to_owned(),
             seconds: done.seconds("/summary/seconds")?,
             learning_seconds: done.seconds("/summary/learned/seconds")?,
             extra_rows: done.get("/summary/extra_rows", "a number of rows", Value::as_u64)?,
@@ -209,6 +217,11 @@ fn member(done: &Document<'_>, m: usize, scored: bool, evaluated: bool) -> Resul
         (None, None) => Verdict::Unscored,
     };
     Ok(Member { seed, verdict, returns })
+}
+
+/// The start of a configuration's SHA-256.
+pub(crate) fn config_hash(config: &str) -> String {
+    sha256_hex(with_old_names(config).as_bytes())[..16].to_owned()
 }
 
 /// A configuration as earlier versions wrote it, so that equal settings have equal hashes: `[single_stage]` was `[joint]`.

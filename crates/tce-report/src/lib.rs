@@ -9,7 +9,9 @@ pub mod diagnosis;
 pub mod error;
 pub mod folder;
 pub mod html;
+pub mod merge;
 pub mod paper;
+pub mod record;
 pub mod sensitivity;
 pub mod stats;
 pub mod study;
@@ -20,7 +22,8 @@ pub use analysis::{Analysis, Options, analyse};
 pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use study::{Budget, Cost, Method, Missing, Recipe, Recommended, Run, Study};
+pub use merge::merge;
+pub use study::{Budget, Change, Cost, Method, Missing, Recipe, Recommended, Run, Study};
 
 use std::path::{Path, PathBuf};
 

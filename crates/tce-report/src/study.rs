@@ -1,8 +1,9 @@
 //! What a report is about: methods, their runs, and what is missing.
 
+use std::fmt;
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Quality, Shift, Task};
 use tce_diagnosis::Diagnosis;
 
@@ -42,7 +43,7 @@ pub fn shift_title(shift: Shift) -> &'static str {
 }
 
 /// A column of the tables.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Method {
     /// Unique among the methods: `tce-og`, or with the name of a sweep's override `tce-og y0.1`.
     pub id: String,
@@ -61,12 +62,12 @@ pub struct Method {
 }
 
 /// Where a run's settings come from, and how long it learned.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Recipe {
     /// The preset that its settings are nearest to; None where they are like none.
     pub preset: Option<String>,
-    /// Where it differs from that preset: `learner.steps = 60 (12000)`.
-    pub changed: Vec<String>,
+    /// Where it differs from that preset.
+    pub changed: Vec<Change>,
     /// What it learned by; None where its settings do not say.
     pub learner: Option<Budget>,
     /// What the same method learns by under the paper's settings.
@@ -80,8 +81,25 @@ impl Recipe {
     }
 }
 
+/// A setting that differs from its preset's; shown as `learner.steps = 60 (12000)`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Change {
+    /// The setting's full name.
+    pub key: String,
+    /// Its value, as TOML.
+    pub value: String,
+    /// The preset's.
+    pub preset: String,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} = {} ({})", self.key, self.value, self.preset)
+    }
+}
+
 /// A learner and how many updates it makes.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Budget {
     /// The learner's name.
     pub learner: String,
@@ -90,7 +108,7 @@ pub struct Budget {
 }
 
 /// The policy that `tce run` recommended for a task, before anybody looked at scores.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Recommended {
     /// The task.
     pub task: Task,
@@ -122,12 +140,14 @@ pub struct Run {
 }
 
 /// A planned or begun run without a result.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Missing {
     /// The task.
     pub task: Task,
     /// The method's id.
     pub method: String,
+    /// Its seed, where it has one.
+    pub seed: Option<u64>,
     /// What it is, in words.
     pub what: String,
     /// Why there is no result.
@@ -135,7 +155,7 @@ pub struct Missing {
 }
 
 /// What a piece of work cost.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// The kind of work, in print.
     pub stage: String,
@@ -150,7 +170,7 @@ pub struct Cost {
 }
 
 /// Everything a report is made from.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Study {
     /// Its name.
     pub name: String,
@@ -174,4 +194,25 @@ pub struct Study {
     pub diagnoses: Vec<Diagnosis>,
     /// The policies that `tce run` recommended.
     pub recommended: Vec<Recommended>,
+}
+
+impl Study {
+    /// A study without a run.
+    pub fn new(name: String, directory: String) -> Self {
+        Self { name, directory, ..Self::default() }
+    }
+
+    /// Adds all members of a run.
+    pub fn add(&mut self, task: Task, method: &str, folder: RunFolder, recipe: &Arc<Recipe>) {
+        let folder = Arc::new(folder);
+        let run = |(index, member): (usize, &Member)| Run {
+            task,
+            method: method.to_owned(),
+            member: member.clone(),
+            index,
+            folder: folder.clone(),
+            recipe: recipe.clone(),
+        };
+        self.runs.extend(folder.members.iter().enumerate().map(run));
+    }
 }

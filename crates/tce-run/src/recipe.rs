@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use clap::ValueEnum;
 use tce_data::Task;
-use tce_report::{Budget, Recipe, RunFolder};
+use tce_report::{Budget, Change, Recipe, RunFolder};
 
 use crate::config::Config;
 use crate::layers::{Layered, Preset, with_current_names};
@@ -61,15 +61,20 @@ fn presets(task: Task, variant: Variant) -> Vec<Known> {
     [Preset::Default, Preset::Quick, Preset::Paper].iter().filter_map(known).collect()
 }
 
-/// What differs, as `learner.steps = 60 (12000)`; what only one of them has is another version's and no difference. None if they have less
-/// than half of the preset's settings in common.
-fn changes(own: &BTreeMap<String, String>, preset: &BTreeMap<String, String>) -> Option<Vec<String>> {
+/// What differs; what only one of them has is another version's and no difference. None if they have less than half of the preset's
+/// settings in common.
+fn changes(own: &BTreeMap<String, String>, preset: &BTreeMap<String, String>) -> Option<Vec<Change>> {
     let common: Vec<_> = preset.iter().filter_map(|(key, value)| Some((key, own.get(key)?, value))).collect();
     if 2 * common.len() < preset.len() {
         return None;
     }
     let differ = common.into_iter().filter(|(_, a, b)| a != b);
-    Some(differ.map(|(key, a, b)| format!("{key} = {a} ({b})")).collect())
+    let change = |(key, value, preset): (&String, &String, &String)| Change {
+        key: key.clone(),
+        value: value.clone(),
+        preset: preset.clone(),
+    };
+    Some(differ.map(change).collect())
 }
 
 impl Recipes {
@@ -115,7 +120,8 @@ mod tests {
         let own = Layered::new(preset, Some(task()), Some(variant), None, &sets).unwrap().config().unwrap().to_toml();
         let known = presets(task(), variant);
         let nearest = known.iter().filter_map(|k| Some((k.name.clone(), changes(&settings(&own), &k.settings)?)));
-        nearest.min_by_key(|(_, changed)| changed.len())
+        let (name, changed) = nearest.min_by_key(|(_, changed)| changed.len())?;
+        Some((name, changed.iter().map(ToString::to_string).collect()))
     }
 
     #[test]

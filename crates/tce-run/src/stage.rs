@@ -34,6 +34,9 @@ pub(crate) const ATTEMPTS: &str = "attempts";
 struct Done<T> {
     /// The program that wrote it.
     program: String,
+    /// The processor that it ran on: another one may give other bytes.
+    #[serde(default)]
+    machine: String,
     /// The attempt that made it.
     attempt: String,
     /// SHA-256 of every file of the stage.
@@ -228,7 +231,13 @@ impl Attempt {
     /// If another attempt was first with other bytes; if a file cannot be read or written.
     pub fn finish<T: Serialize>(self, files: &[String], summary: T) -> Result<()> {
         let hashes = files.iter().map(|f| Ok((f.clone(), sha256_file(&self.file(f))?))).collect::<Result<_>>()?;
-        let done = Done { program: PROGRAM.into(), attempt: self.name.clone(), files: hashes, summary };
+        let done = Done {
+            program: PROGRAM.into(),
+            machine: tce_nn::machine(),
+            attempt: self.name.clone(),
+            files: hashes,
+            summary,
+        };
         let own = self.file("done.json");
         write_json(&own, &done)?;
         if link_first(&own, &self.stage.file("done.json"))? {
@@ -344,7 +353,8 @@ mod tests {
         let attempt = s.attempt().unwrap();
         fs::write(attempt.file("rows"), b"data").unwrap();
         let files = BTreeMap::from([("rows".to_owned(), sha256_hex(b"data"))]);
-        let done = Done { program: "tce".into(), attempt: attempt.name.clone(), files, summary: 7u32 };
+        let done =
+            Done { program: "tce".into(), machine: String::new(), attempt: attempt.name.clone(), files, summary: 7u32 };
         write_json(&s.file("done.json"), &done).unwrap();
         drop(attempt);
         assert_eq!(s.summary::<u32>().unwrap(), Some(7));

@@ -1,18 +1,17 @@
-//! What a report is made from: a sweep's folder, or a folder with runs of `tce run`.
-
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+//! What a report is made from: sweeps' folders, folders with runs of `tce run`, and records of either.
 
 use clap::ValueEnum;
 use serde_json::Value;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
 use tce_base::FileError;
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
 use tce_learn::Mode;
 use tce_report::folder::Verdict;
-use tce_report::{Cost, Method, Missing, Recipe, Recommended, ReportError, Run, RunFolder, Study};
+use tce_report::merge::columns;
+use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, record};
 
 use crate::config::Config;
 use crate::diagnosis;
@@ -22,12 +21,37 @@ use crate::sweep::gather::Checked;
 use crate::sweep::{Entry, Kind, Sweep};
 use crate::variant::Variant;
 
-/// Everything that `directory` holds for a report.
+/// Everything that `places` hold for a report, as one study: sweeps' folders, folders of `tce run`, records, and folders of records.
 ///
 /// # Errors
-/// If there is neither a sweep nor a run, or a file of one is damaged.
-pub fn of_directory(directory: &Path) -> Result<Study> {
-    if directory.join("manifest.jsonl").exists() { of_sweep(&Sweep::open(directory)?) } else { of_runs(directory) }
+/// If one of them is none of these, or a file in it is damaged.
+pub fn of_places(places: &[PathBuf]) -> Result<Study> {
+    let mut studies = Vec::new();
+    for place in places {
+        if place.join("manifest.jsonl").exists() {
+            studies.push(of_sweep(&Sweep::open(place)?)?);
+            continue;
+        }
+        let records = records(place)?;
+        if records.is_empty() {
+            studies.push(of_runs(place)?);
+        }
+        for path in records {
+            studies.push(record::read(&path)?);
+        }
+    }
+    Ok(merge(studies))
+}
+
+/// The records at `place`: the file itself, or those that lie in the folder.
+fn records(place: &Path) -> Result<Vec<PathBuf>> {
+    if place.is_file() {
+        // Whatever else it is, the reader of records says.
+        return Ok(vec![place.to_owned()]);
+    }
+    let mut found: Vec<PathBuf> = entries(place)?.into_iter().filter(|p| record::is_record(p)).collect();
+    found.sort();
+    Ok(found)
 }
 
 /// A column; `config` is that of one of its runs, the variant's own without.
@@ -88,21 +112,18 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     let recommended = recommended(&sweep.directory.join("runs"), &mut notes);
     let mut recipes = Recipes::default();
     let mut study = Study {
-        name: sweep.manifest.header.name.clone(),
         sweep: true,
-        directory: sweep.directory.display().to_string(),
         methods: in_order(methods),
-        runs: Vec::new(),
-        missing: Vec::new(),
         conflicts: sweep.conflicts().iter().map(|p| p.display().to_string()).collect(),
         notes,
-        costs: Vec::new(),
         diagnoses,
         recommended,
+        ..Study::new(sweep.manifest.header.name.clone(), sweep.directory.display().to_string())
     };
     for entry in runs() {
         let mut missing = |why: String| {
-            study.missing.push(Missing { task: entry.task, method: entry.column(), what: entry.to_string(), why });
+            let (method, seed) = (entry.column(), Some(entry.seed));
+            study.missing.push(Missing { task: entry.task, method, seed, what: entry.to_string(), why });
         };
         match sweep.check(entry) {
             Checked::Missing => missing(match sweep.failure(entry) {
@@ -125,7 +146,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
                         });
                         let variant = entry.variant.map(Variant::name).unwrap_or_default();
                         let recipe = recipes.of(entry.task, variant, &folder);
-                        add_runs(&mut study.runs, entry.task, &entry.column(), folder, &recipe);
+                        study.add(entry.task, &entry.column(), folder, &recipe);
                     }
                 }
             }
@@ -194,24 +215,15 @@ fn agree(sweep: &Sweep, entry: &Entry, recorded: Option<f64>, folder: &RunFolder
     .into())
 }
 
-fn add_runs(runs: &mut Vec<Run>, of: Task, method: &str, folder: RunFolder, recipe: &Arc<Recipe>) {
-    let folder = Arc::new(folder);
-    for (index, member) in folder.members.iter().enumerate() {
-        runs.push(Run {
-            task: of,
-            method: method.to_owned(),
-            member: member.clone(),
-            index,
-            folder: folder.clone(),
-            recipe: recipe.clone(),
-        });
-    }
+/// What lies in `directory`.
+fn entries(directory: &Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(directory).map_err(|e| FileError::new(directory, "read the directory", e))?;
+    Ok(entries.flatten().map(|e| e.path()).collect())
 }
 
 /// The directories in `directory`, ascending, without hidden ones.
 fn directories(directory: &Path) -> Result<Vec<PathBuf>> {
-    let entries = fs::read_dir(directory).map_err(|e| FileError::new(directory, "read the directory", e))?;
-    let mut found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
+    let mut found: Vec<PathBuf> = entries(directory)?.into_iter().filter(|p| p.is_dir()).collect();
     found.retain(|p| !name_of(p).starts_with('.'));
     found.sort();
     Ok(found)
@@ -236,7 +248,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
             let Some((name, _)) = full.rsplit_once('-').filter(|_| run.join("spec.json").exists()) else { continue };
             let mut lost = |why: String| {
                 let what = format!("{name}, {of}, {}", run.display());
-                missing.push(Missing { task: of, method: name.to_owned(), what, why });
+                missing.push(Missing { task: of, method: name.to_owned(), seed: None, what, why });
             };
             match RunFolder::read(&run)? {
                 None => lost("not finished: no done.json".into()),
@@ -250,12 +262,12 @@ fn of_runs(directory: &Path) -> Result<Study> {
     if finished.is_empty() && missing.is_empty() {
         return Err(Error::missing(
             directory,
-            "found neither a sweep (manifest.jsonl) nor runs (TASK/METHOD-KEY/spec.json); give the folder of `tce sweep plan --out` or \
-             that of `tce run --out`, which is runs/ unless told otherwise",
+            "found neither a sweep (manifest.jsonl) nor runs (TASK/METHOD-KEY/spec.json) nor a record of `tce sweep export`; give the \
+             folder of `tce sweep plan --out`, that of `tce run --out`, which is runs/ unless told otherwise, or a record",
         ));
     }
     let mut notes = Vec::new();
-    let ids = columns(&finished, &mut notes);
+    let ids = ids(&finished, &mut notes);
     let mut methods: Vec<Method> = Vec::new();
     for (name, id) in finished.iter().map(|f| &f.1).zip(&ids).chain(missing.iter().map(|m| (&m.method, &m.method))) {
         if methods.iter().any(|m| m.id == *id) {
@@ -272,69 +284,47 @@ fn of_runs(directory: &Path) -> Result<Study> {
         });
     }
     let methods = in_order(methods);
-    let mut costs: Vec<Cost> = networks(directory).into_values().collect();
-    let mut runs = Vec::new();
+    let name = directory.canonicalize().map_or_else(|_| name_of(directory), |d| name_of(&d));
+    let diagnoses = diagnoses(directory, &mut notes);
+    let recommended = recommended(directory, &mut notes);
+    let costs = networks(directory).into_values().collect();
+    let mut study = Study {
+        methods,
+        missing,
+        notes,
+        costs,
+        diagnoses,
+        recommended,
+        ..Study::new(name, directory.display().to_string())
+    };
     let mut recipes = Recipes::default();
     for ((of, name, folder), id) in finished.into_iter().zip(ids) {
-        costs.push(Cost {
-            stage: learning(&method_title(&methods, &id)),
+        study.costs.push(Cost {
+            stage: learning(&method_title(&study.methods, &id)),
             agent: of.agent,
             seconds: folder.learning_seconds,
             seeds: folder.members.len(),
             memory: None,
         });
         let recipe = recipes.of(of, &name, &folder);
-        add_runs(&mut runs, of, &id, folder, &recipe);
+        study.add(of, &id, folder, &recipe);
     }
-    let name = directory.canonicalize().map_or_else(|_| name_of(directory), |d| name_of(&d));
-    let diagnoses = diagnoses(directory, &mut notes);
-    let recommended = recommended(directory, &mut notes);
-    Ok(Study {
-        name,
-        sweep: false,
-        directory: directory.display().to_string(),
-        methods,
-        runs,
-        missing,
-        conflicts: Vec::new(),
-        notes,
-        costs,
-        diagnoses,
-        recommended,
-    })
+    Ok(study)
 }
 
-/// The column of every finished run: its name. Where a task has two runs of one name and seed, they differ in their settings or
-/// their data, and every setting, or else every folder, of that name is a column of its own.
-fn columns(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
-    let mut ids: Vec<String> = finished.iter().map(|(_, name, _)| name.clone()).collect();
-    let marks: [fn(&RunFolder) -> String; 2] = [
-        |f| f.config_hash[..6].to_owned(),
-        |f| name_of(&f.directory).rsplit('-').next().unwrap_or_default().to_owned(),
-    ];
-    for mark in marks {
-        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
-        let mut twice: BTreeSet<String> = BTreeSet::new();
-        for ((of, name, folder), id) in finished.iter().zip(&ids) {
-            for member in &folder.members {
-                if !seen.insert((*of, id, member.seed)) {
-                    twice.insert(name.clone());
-                }
-            }
-        }
-        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|((_, name, _), _)| twice.contains(name)) {
-            *id = format!("{name} {}", mark(folder));
-        }
-        for name in twice {
-            let note = format!(
-                "{name}: a task has several runs of one seed with different settings or data; each is a column of its own."
-            );
-            if !notes.contains(&note) {
-                notes.push(note);
-            }
-        }
-    }
-    ids
+/// The column of every finished run ([`columns`] of each of its members).
+fn ids(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
+    let members = finished.iter().flat_map(|(task, name, folder)| {
+        folder.members.iter().map(move |member| (*task, name.as_str(), folder, member.seed))
+    });
+    let (all, told) = columns(&members.collect::<Vec<_>>());
+    notes.extend(told);
+    let mut all = all.into_iter();
+    let first = |(_, name, folder): &(Task, String, RunFolder)| {
+        let own: Vec<String> = all.by_ref().take(folder.members.len()).collect();
+        own.into_iter().next().unwrap_or_else(|| name.clone())
+    };
+    finished.iter().map(first).collect()
 }
 
 fn json(path: &Path) -> Option<Value> {

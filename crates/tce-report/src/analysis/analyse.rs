@@ -4,7 +4,7 @@ use tce_base::Streams;
 use tce_data::{Shift, Task};
 
 use super::*;
-use super::{compare, recipes, recommended, warnings};
+use super::{compare, effects, recipes, recommended, warnings};
 
 /// The figures of `study`.
 ///
@@ -52,18 +52,21 @@ pub fn analyse(study: &Study, options: &Options) -> Result<Analysis> {
         .map(|m| m.published || study.runs.iter().any(|r| r.method == m.id && r.folder.published))
         .collect();
     let warnings = warnings::warnings(study, &tasks, &scores, comparison.as_ref(), &published);
-    Ok(Analysis {
+    let mut analysis = Analysis {
         name: study.name.clone(),
         methods: study.methods.clone(),
         published,
         tables,
         comparison,
+        gaps: Vec::new(),
         recipes: Recipes::of(study),
         recommendations: recommended::recommendations(study),
         warnings,
         level: options.level,
         resamples: options.resamples,
-    })
+    };
+    analysis.gaps = effects::gaps(&analysis);
+    Ok(analysis)
 }
 
 /// The study's tasks in the paper's order, those without a result included.
@@ -120,16 +123,17 @@ fn shift_table(
             paper: paper.and_then(|p| p.row(&tasks[t])).map_or_else(|| vec![None; columns], <[_]>::to_vec),
         });
     }
-    let total = |name: &str, lists: Vec<Vec<f64>>| -> Result<Option<Total>> {
-        if lists.is_empty() {
-            return Ok(None);
-        }
-        let tasks = lists.len();
-        let scores = Scores::new(lists)?;
-        let estimate = bootstrap.intervals(name, Draw::Runs, &[&scores], |s| vec![s[0].total()])?[0];
-        Ok(Some(Total { estimate, tasks }))
-    };
-    let mut totals = Vec::new();
+    let over =
+        |name: &str, lists: Vec<Vec<f64>>, statistic: &(dyn Fn(&Scores) -> f64 + Sync)| -> Result<Option<Total>> {
+            if lists.is_empty() {
+                return Ok(None);
+            }
+            let tasks = lists.len();
+            let scores = Scores::new(lists)?;
+            let estimate = bootstrap.intervals(name, Draw::Runs, &[&scores], |s| vec![statistic(s[0])])?[0];
+            Ok(Some(Total { estimate, tasks }))
+        };
+    let (mut totals, mut iqms) = (Vec::new(), Vec::new());
     let mut against = Vec::new();
     for (m, method) in methods.iter().enumerate() {
         let lists = |want: &dyn Fn(usize) -> bool| -> Vec<Vec<f64>> {
@@ -137,11 +141,12 @@ fn shift_table(
             kept.map(|(_, &t)| scores[t][m].clone()).collect()
         };
         let name = format!("total/{shift}/{}", method.id);
-        totals.push(total(&name, lists(&|_| true))?);
+        totals.push(over(&name, lists(&|_| true), &Scores::total)?);
+        iqms.push(over(&format!("iqm/{name}"), lists(&|_| true), &Scores::iqm)?);
         let paper_method = paper::counterpart(&method.base).filter(|_| method.plain);
         let Some((paper_method, column)) = paper_method.and_then(|p| Some((p, paper?.column(p)?))) else { continue };
         let printed = |k: usize| rows[k].paper[column];
-        let ours = total(&format!("against/{name}"), lists(&|k| printed(k).is_some()))?;
+        let ours = over(&format!("against/{name}"), lists(&|k| printed(k).is_some()), &Scores::total)?;
         if let Some(ours) = ours {
             let both = (0..rows.len()).filter(|k| rows[*k].cells[m].is_some());
             let paper = both.filter_map(|k| printed(k).map(|p| p.mean)).sum();
@@ -155,5 +160,5 @@ fn shift_table(
         })
         .collect();
     let doubt = recipes::doubt(study, shift);
-    Ok(ShiftTable { shift, rows, totals, paper, paper_totals, against, doubt })
+    Ok(ShiftTable { shift, rows, totals, iqms, paper, paper_totals, against, doubt })
 }

@@ -80,6 +80,7 @@ pub(super) fn compare(
             over_seeds: [runs[0], runs[1], runs[2], runs[3]],
             over_tasks: [both[0], both[1], both[2], both[3]],
             total: runs[4],
+            rank: rank(&tables, kept.iter().position(|k| *k == m).expect("it is kept")),
             profile,
             over_baselines,
             p_value,
@@ -87,6 +88,23 @@ pub(super) fn compare(
     }
     let tasks = places.iter().map(|&t| tasks[t]).collect();
     Ok(Some(Comparison { tasks, methods, left_out, baselines, best_baseline, level: bootstrap.level, thresholds }))
+}
+
+/// Mean over tasks of the place of method `m` of `tables`, by the mean over runs.
+fn rank(tables: &[Scores], m: usize) -> f64 {
+    let means: Vec<Vec<f64>> = tables.iter().map(|t| t.task_means().collect()).collect();
+    let place = |t: usize| {
+        let (higher, equal) =
+            means.iter().fold((0, 0), |(higher, equal), other| match other[t].total_cmp(&means[m][t]) {
+                std::cmp::Ordering::Greater => (higher + 1, equal),
+                std::cmp::Ordering::Equal => (higher, equal + 1),
+                std::cmp::Ordering::Less => (higher, equal),
+            });
+        // Of `equal` methods that share places the mean one; it is one of them itself.
+        f64::from(higher) + f64::from(1 + equal) / 2.0
+    };
+    let tasks = means[m].len();
+    (0..tasks).map(place).sum::<f64>() / tasks as f64
 }
 
 /// Every second point from below the lowest score to above the highest, 0 and 100 included.

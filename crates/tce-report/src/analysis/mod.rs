@@ -11,12 +11,14 @@ use crate::study::{Method, Run, Study, order};
 
 mod analyse;
 mod compare;
+mod effects;
 mod opening;
 mod recipes;
 mod recommended;
 mod warnings;
 
 pub use analyse::analyse;
+pub use effects::{Effect, Gap, LEAST, SURE};
 pub use opening::{gap_words, opening, verdict_words};
 pub use recipes::{Recipes, thousands};
 pub use recommended::Recommendation;
@@ -62,10 +64,10 @@ pub struct Cell {
     pub above_baselines: Option<bool>,
 }
 
-/// A sum over tasks.
+/// A sum or a mean over tasks.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Total {
-    /// Sum over tasks of the mean over seeds.
+    /// Sum over tasks of the mean over seeds, or interquartile mean of all runs.
     #[serde(flatten)]
     pub estimate: Estimate,
     /// Tasks in it.
@@ -105,6 +107,8 @@ pub struct ShiftTable {
     pub rows: Vec<Row>,
     /// By method.
     pub totals: Vec<Option<Total>>,
+    /// Interquartile means over the same tasks, by method.
+    pub iqms: Vec<Option<Total>>,
     /// The paper's table.
     #[serde(skip)]
     pub paper: Option<&'static PaperTable>,
@@ -131,6 +135,8 @@ pub struct Aggregate {
     pub over_tasks: [Estimate; 4],
     /// Sum over tasks of the mean over seeds.
     pub total: Estimate,
+    /// Mean over tasks of its place among the methods by the mean over seeds; 1 is the best, equal ones share their places.
+    pub rank: f64,
     /// Share of runs above every threshold of the comparison.
     #[serde(skip)]
     pub profile: Vec<Estimate>,
@@ -211,6 +217,8 @@ pub struct Analysis {
     pub tables: Vec<ShiftTable>,
     /// Methods beside each other; None without a score.
     pub comparison: Option<Comparison>,
+    /// Methods beside the best baseline, task by task.
+    pub gaps: Vec<Gap>,
     /// Presets and learner updates of the runs.
     pub recipes: Recipes,
     /// What the recommended policies came to.

@@ -62,7 +62,7 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
                         @if let Some(f) = baseline {
                             th class="edge" colspan="4" { "Against the best baseline, " (title(f.method)) }
                         }
-                        th class="edge" colspan="2" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
+                        th class="edge" colspan="3" { "Over " (counted(c.tasks.len(), "task", "tasks")) }
                     }
                     tr {
                         th class="first" { "Method" }
@@ -71,7 +71,7 @@ pub(super) fn findings(study: &Study, analysis: &Analysis) -> Markup {
                             th class="edge" { "Points above it" } th { (term("improvement", "Share of pairs higher")) } th { (term("p", "p")) }
                             th class="text" { "Finding" }
                         }
-                        th class="edge" { "Mean" } th { "Total" }
+                        th class="edge" { "Mean" } th { "Total" } th { "Mean rank" }
                     }
                 }
                 tbody { @for a in &c.methods { (row(analysis, c, baseline, a)) } }
@@ -110,6 +110,7 @@ fn row(analysis: &Analysis, c: &Comparison, baseline: Option<&Aggregate>, a: &Ag
             }
             td class="edge" { (estimate(&a.over_seeds[2], 1)) }
             td { (estimate(&a.total, 1)) }
+            td { (one(a.rank)) }
         }
     }
 }

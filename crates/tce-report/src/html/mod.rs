@@ -9,6 +9,7 @@ use crate::study::{Study, shift_title};
 
 mod cost;
 mod curves;
+mod effects;
 mod findings;
 mod methods;
 pub(crate) mod parts;
@@ -35,9 +36,12 @@ pub fn page(study: &Study, analysis: &Analysis) -> String {
     ];
     if !study.diagnoses.is_empty() {
         sections.insert(
-            3,
+            sections.len() - 4,
             ("diagnoses", "Generated rows and real source rows", crate::diagnosis::section(study, analysis)),
         );
+    }
+    if let Some(section) = effects::effects(analysis) {
+        sections.insert(2, ("effects", "Where methods help and harm", section));
     }
     if let Some(section) = crate::sensitivity::section(study, analysis) {
         sections.insert(2, ("sensitivity", "Sensitivity", section));

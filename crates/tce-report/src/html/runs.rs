@@ -23,7 +23,8 @@ pub(super) fn runs(study: &Study) -> Markup {
     html! {
         p {
             "Every score with what decided it: seed, settings, hashes of data and results, and the program. The runs lie in "
-            code { (study.directory) } "."
+            code { (study.directory) } ". The call that makes a run again stands beside its hashes: on the same data, a processor with the same \
+             instructions and the same version of the program, it gives the same policy byte for byte."
         }
         @for task in &tasks {
             @let list: Vec<&Run> = study.methods.iter().flat_map(|m| study.runs.iter().filter(move |r| r.task == *task && r.method == m.id)).collect();
@@ -38,7 +39,7 @@ pub(super) fn runs(study: &Study) -> Markup {
                                 th class="text" { "Folder and hashes" }
                             }
                         }
-                        tbody { @for run in list { (run_row(run)) } }
+                        tbody { @for run in list { (run_row(study, run)) } }
                     }
                 }
             }
@@ -75,7 +76,16 @@ fn recipe(recipe: &Recipe) -> Markup {
     }
 }
 
-fn run_row(run: &Run) -> Markup {
+/// The call that makes this run again, where its settings are those of a preset with changes.
+pub(crate) fn command(study: &Study, run: &Run) -> Option<String> {
+    let method = study.methods.iter().find(|m| m.id == run.method)?;
+    let preset = run.recipe.preset.as_ref()?;
+    let sets: String = run.recipe.changed.iter().map(|c| format!(" --set '{}={}'", c.key, c.value)).collect();
+    let (task, variant, seed) = (run.task, &method.variant, run.member.seed);
+    Some(format!("tce run {task} --preset {preset} --variant {variant} --no-baselines --seeds 1 --seed {seed}{sets}"))
+}
+
+fn run_row(study: &Study, run: &Run) -> Markup {
     let folder = &run.folder;
     let returns = &run.member.returns;
     let (low, high) = returns.iter().fold((f64::MAX, f64::MIN), |(l, h), r| (l.min(*r), h.max(*r)));
@@ -106,6 +116,8 @@ fn run_row(run: &Run) -> Markup {
                     summary { code { (folder.directory.display()) } }
                     table {
                         tbody {
+                            @if let Some(command) = command(study, run) { tr { th { "make it again" } td class="text" { code { (command) } } } }
+                            @if !folder.machine.is_empty() { tr { th { "processor" } td class="text" { (folder.machine) } } }
                             @for (name, value) in &folder.inputs { tr { th { "input: " (name) } td class="text" { code { (value) } } } }
                             @for (name, hash) in &folder.files { tr { th { (name) } td class="text" { code { (hash) } } } }
                         }

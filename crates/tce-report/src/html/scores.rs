@@ -71,6 +71,16 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
             (sum, n) => html! { (one(sum)) (of(n)) },
         },
     };
+    let iqm = |c: Column| match c {
+        Column::Ours(m) => html! {
+            @match &t.iqms[m] {
+                None => "–",
+                Some(Total { estimate, .. }) => { (one(estimate.point)) br; small { (range(estimate.interval, 1)) } }
+            }
+        },
+        // The paper does not print single runs.
+        Column::Paper(_) => html! { "–" },
+    };
     html! {
         h3 { (shift_title(t.shift)) }
         @if let Some(doubt) = &t.doubt { p class="doubt" { (doubt) } }
@@ -101,6 +111,10 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                     tr class="sum" {
                         th scope="row" { "Total" }
                         @for (c, class) in &columns { td class=(class) { (total(*c)) } }
+                    }
+                    tr {
+                        th scope="row" { (term("iqm", "Interquartile mean")) }
+                        @for (c, class) in &columns { td class=(class) { (iqm(*c)) } }
                     }
                     @if t.paper.is_some_and(|p| p.rows.len() == t.rows.len()) {
                         tr {

@@ -12,77 +12,13 @@ use tce_data::{Task, main_file};
 use crate::config::{Config, GeneratedRows, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
 use crate::inputs::{DataArgs, ensure_data};
-use crate::layers::{Layered, Preset};
+use crate::layers::Layered;
 use crate::variant::Variant;
 
-/// More runs than this are taken for a typing error.
-const MOST_RUNS: u64 = 100_000;
+use super::description::{Description, Files, Override};
+
 /// Version of the format. Increase it when older manifests cannot be read.
 const FORMAT: u32 = 1;
-
-/// A sweep's description, `sweep.toml`: tasks × variants × overrides × seeds.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Description {
-    /// Tasks, `*` standing for anything: `hopper-*:medium->*`.
-    pub tasks: Vec<String>,
-    /// Methods.
-    pub variants: Vec<Variant>,
-    /// Whether the baselines are run beside them.
-    #[serde(default = "yes", alias = "floors")]
-    pub baselines: bool,
-    /// Seeds, one run each.
-    #[serde(default = "one")]
-    pub seeds: u64,
-    /// The first seed.
-    #[serde(default)]
-    pub first_seed: u64,
-    /// Where the configuration starts.
-    #[serde(default)]
-    pub preset: Preset,
-    /// A configuration file on top of it, relative to the description.
-    pub config: Option<PathBuf>,
-    /// Single keys on top of that, `"learner.steps=100_000"`.
-    #[serde(default)]
-    pub set: Vec<String>,
-    /// Collect what is not given by the zoo's actors only.
-    #[serde(default)]
-    pub from_zoo: bool,
-    /// Data files of a task, relative to the description.
-    #[serde(default)]
-    pub data: BTreeMap<Task, Files>,
-    /// Further settings, one column each; empty: one column without a name.
-    #[serde(default)]
-    pub overrides: Vec<Override>,
-}
-
-/// Data files of a task.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Files {
-    /// Source data.
-    pub source: Option<PathBuf>,
-    /// Target data.
-    pub target: Option<PathBuf>,
-}
-
-/// A further column of the table.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Override {
-    /// Its name.
-    pub name: String,
-    /// What it changes.
-    pub set: Vec<String>,
-}
-
-fn yes() -> bool {
-    true
-}
-
-fn one() -> u64 {
-    1
-}
 
 /// What a piece of work is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -124,6 +60,9 @@ pub struct Entry {
     pub seed: u64,
     /// Hash of its configuration.
     pub config: String,
+    /// The tier that it belongs to, the first of those that share it; empty without tiers.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub tier: String,
     /// Indices of work that should be done before. If it is not, this piece does it itself.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<usize>,
@@ -199,10 +138,7 @@ impl Manifest {
         let text = fs::read_to_string(path).map_err(|e| Error::Usage(FileError::new(path, "read", e).to_string()))?;
         let description: Description = toml::from_str(&text).map_err(|e| failed(&e))?;
         let base = path.parent().unwrap_or(Path::new("."));
-        let tasks = tasks(&description.tasks).map_err(|e| failed(&e))?;
-        if description.variants.is_empty() || description.seeds == 0 {
-            return Err(failed(&"there is nothing to run; give at least one task, one of `variants`, and seeds > 0"));
-        }
+        let parts = description.parts().map_err(|e| failed(&e))?;
         let (mut data, mut hashes) = (description.data.clone(), BTreeMap::new());
         for (task, files) in &mut data {
             for file in files.source.iter_mut().chain(&mut files.target) {
@@ -213,14 +149,6 @@ impl Manifest {
                 }
             }
         }
-        let mut variants = description.variants.clone();
-        if description.baselines {
-            variants.extend(Variant::BASELINES);
-        }
-        let mut seen = BTreeSet::new();
-        variants.retain(|v| seen.insert(*v));
-        let plain = [Override { name: String::new(), set: Vec::new() }];
-        let overrides = if description.overrides.is_empty() { &plain[..] } else { &description.overrides };
         let file = description.config.as_ref().map(|c| base.join(c));
 
         let header = Header {
@@ -233,23 +161,19 @@ impl Manifest {
             configs: BTreeMap::new(),
             entries: 0,
         };
-        let runs = [tasks.len(), variants.len(), overrides.len()].iter().product::<usize>() as u64;
-        if description.seeds > MOST_RUNS / runs || description.first_seed.checked_add(description.seeds).is_none() {
-            return Err(failed(&format!("{runs} x {} runs; a sweep has at most {MOST_RUNS}", description.seeds)));
-        }
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
         // What the data of a task are needed for: with as many source rows, or without a source.
         let mut wanted = BTreeSet::new();
-        for &task in &tasks {
-            for &variant in &variants {
-                for Override { name, set } in overrides {
+        for part in &parts {
+            for (&task, &variant) in part.tasks.iter().flat_map(|t| part.variants.iter().map(move |v| (t, v))) {
+                for Override { name, set } in &part.overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
                     wanted.insert((task, config.needs_source().then_some(config.source.rows)));
-                    for seed in description.first_seed..description.first_seed + description.seeds {
-                        plan.add_run(&mut known, task, variant, name, &config, seed);
+                    for seed in part.seeds.clone() {
+                        plan.add_run(&mut known, &part.name, (task, variant, name), &config, seed);
                     }
                 }
             }
@@ -277,9 +201,8 @@ impl Manifest {
     fn add_run(
         &mut self,
         known: &mut BTreeMap<String, usize>,
-        task: Task,
-        variant: Variant,
-        label: &str,
+        tier: &str,
+        (task, variant, label): (Task, Variant, &str),
         config: &Config,
         seed: u64,
     ) {
@@ -296,6 +219,7 @@ impl Manifest {
             label: String::new(),
             seed,
             config: hash.clone(),
+            tier: tier.to_owned(),
             needs,
         };
         let rows = serde_json::json!([config.source, config.target]);
@@ -335,10 +259,21 @@ impl Manifest {
         self.add(known, Entry { variant: Some(variant), label: label.to_owned(), ..run });
     }
 
-    /// Work that others need comes first.
+    /// Tiers one after the other, in each one seed after the other, and for each seed task after task with what its runs need: whoever stops
+    /// early has whole tasks.
     fn sorted(mut self) -> Self {
+        // Tiers and tasks have the order in which their first work was added.
+        let (mut tiers, mut tasks): (BTreeMap<String, usize>, BTreeMap<Task, usize>) = Default::default();
+        for entry in &self.entries {
+            let (tier, task) = (tiers.len(), tasks.len());
+            tiers.entry(entry.tier.clone()).or_insert(tier);
+            tasks.entry(entry.task).or_insert(task);
+        }
         let mut order: Vec<usize> = (0..self.entries.len()).collect();
-        order.sort_by_key(|&i| (self.entries[i].kind, i));
+        order.sort_by_key(|&i| {
+            let Entry { tier, seed, task, kind, .. } = &self.entries[i];
+            (tiers[tier], *seed, tasks[task], *kind, i)
+        });
         let mut place = vec![0; order.len()];
         order.iter().enumerate().for_each(|(new, &old)| place[old] = new);
         let mut entries: Vec<Entry> = order.iter().map(|&i| self.entries[i].clone()).collect();
@@ -415,38 +350,6 @@ impl Manifest {
         })?;
         config.validate()?;
         Ok(config)
-    }
-}
-
-/// The tasks that match the patterns, in the order of the patterns.
-fn tasks(patterns: &[String]) -> Result<Vec<Task>, String> {
-    let mut out: Vec<Task> = Vec::new();
-    for pattern in patterns {
-        let found: Vec<Task> = if pattern.contains('*') {
-            Task::all()
-                .into_iter()
-                .filter(|t| glob(pattern, &t.to_string()) || glob(pattern, &t.with_arrow()))
-                .collect()
-        } else {
-            vec![pattern.parse()?]
-        };
-        if found.is_empty() {
-            return Err(format!("tasks: `{pattern}` matches none of the 108 tasks ROBOT-SHIFT/SOURCE/TARGET"));
-        }
-        out.extend(found.into_iter().filter(|t| !out.contains(t)).collect::<Vec<_>>());
-    }
-    match out.is_empty() {
-        true => Err("tasks: none".into()),
-        false => Ok(out),
-    }
-}
-
-fn glob(pattern: &str, text: &str) -> bool {
-    match pattern.split_once('*') {
-        None => pattern == text,
-        Some((head, rest)) => text
-            .strip_prefix(head)
-            .is_some_and(|tail| (0..=tail.len()).any(|k| tail.is_char_boundary(k) && glob(rest, &tail[k..]))),
     }
 }
 

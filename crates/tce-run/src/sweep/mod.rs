@@ -22,6 +22,7 @@ use tce_base::{FileError, read_if_there, sha256_file, write_atomically};
 use crate::error::{Error, Result};
 use crate::inputs::DataArgs;
 
+mod description;
 pub mod gather;
 pub mod local;
 mod manifest;
@@ -30,7 +31,8 @@ pub mod slurm;
 pub mod status;
 pub mod work;
 
-pub use manifest::{Description, Entry, Files, Header, Kind, Manifest, Override};
+pub use description::{Description, Files, Override, Tier};
+pub use manifest::{Entry, Header, Kind, Manifest};
 pub use repair::Check;
 
 /// The list of work in a sweep's folder.

@@ -34,8 +34,26 @@ pub struct Status {
     /// Seconds until everything is done, if as many processes keep running; None if nothing of this kind is finished yet, if
     /// something failed, and if nothing is running.
     pub seconds_left: Option<f64>,
+    /// Tiers, in their order; empty where the sweep has none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tiers: Vec<TierState>,
     /// Scores so far: task, method, scores.
     pub scores: Vec<(String, String, Vec<f64>)>,
+}
+
+/// How far a tier is.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TierState {
+    /// Its name.
+    pub name: String,
+    /// Finished pieces of work.
+    pub done: usize,
+    /// All pieces of work.
+    pub all: usize,
+    /// Seconds that the finished ones took.
+    pub seconds: f64,
+    /// Seconds that the others take, one after the other; None as long as nothing of their kind is finished.
+    pub seconds_left: Option<f64>,
 }
 
 /// A piece of work that is running.
@@ -67,6 +85,7 @@ impl Sweep {
             waiting: Vec::new(),
             faults: fs::read_dir(self.directory.join("faults")).map_or(0, Iterator::count),
             seconds_left: None,
+            tiers: Vec::new(),
             scores: Vec::new(),
         };
         // Seconds that work of a kind and column took, and what is left of it.
@@ -99,6 +118,7 @@ impl Sweep {
                 status.waiting.push(entry.index);
             }
         }
+        status.tiers = self.tiers(&times)?;
         let known = times.values().all(|&(_, done, left)| done > 0 || left == 0);
         let work: f64 = times.values().map(|&(seconds, done, left)| seconds / done.max(1) as f64 * left as f64).sum();
         // What failed may fail again, and what nobody does takes for ever.
@@ -106,6 +126,32 @@ impl Sweep {
         status.seconds_left = known.then(|| work / status.running.len() as f64);
         status.scores = scores.into_iter().map(|((task, column), scores)| (task, column, scores)).collect();
         Ok(status)
+    }
+
+    /// The tiers; `times` is what work of a kind and column took, and how many pieces of it are done and left.
+    fn tiers(&self, times: &BTreeMap<(Kind, String), (f64, usize, usize)>) -> Result<Vec<TierState>> {
+        let mut tiers: Vec<TierState> = Vec::new();
+        for entry in self.entries().iter().filter(|e| !e.tier.is_empty()) {
+            let at = tiers.iter().position(|t| t.name == entry.tier).unwrap_or_else(|| {
+                let name = entry.tier.clone();
+                tiers.push(TierState { name, done: 0, all: 0, seconds: 0.0, seconds_left: Some(0.0) });
+                tiers.len() - 1
+            });
+            let tier = &mut tiers[at];
+            tier.all += 1;
+            match self.outcome(entry)? {
+                Some(outcome) => {
+                    tier.done += 1;
+                    tier.seconds += outcome.seconds;
+                }
+                None => {
+                    let (seconds, done, _) = times[&(entry.kind, entry.column())];
+                    let each = (done > 0).then(|| seconds / done as f64);
+                    tier.seconds_left = tier.seconds_left.zip(each).map(|(sum, each)| sum + each);
+                }
+            }
+        }
+        Ok(tiers)
     }
 
     /// Running processes, by the work's id.

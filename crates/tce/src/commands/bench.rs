@@ -84,7 +84,7 @@ impl Bench {
         }
         let report = Report {
             program: tce_base::PROGRAM.to_owned(),
-            processor: processor(),
+            processor: tce_nn::processor(),
             device: kind,
             seeds: self.seeds,
             instructions: tce_nn::instructions(),
@@ -99,13 +99,6 @@ impl Bench {
         output.print(&report, render);
         Ok(())
     }
-}
-
-/// The processor's name, as the kernel tells it.
-fn processor() -> String {
-    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let line = info.lines().find(|l| l.starts_with("model name"));
-    line.and_then(|l| l.split(": ").nth(1)).unwrap_or("unknown").to_owned()
 }
 
 fn whole_task(measured: &[Measured]) -> Result<Option<WholeTask>> {

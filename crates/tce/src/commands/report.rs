@@ -1,22 +1,24 @@
 //! `tce report`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde::Serialize;
 use tce_report::analysis::{Aggregate, Comparison, opening};
 use tce_report::{Analysis, Options, analyse};
 use tce_run::error::{Error, Result};
-use tce_run::study::of_directory;
+use tce_run::study::of_places;
 
 use crate::output::{Output, prose, table};
 
 /// Arguments of `report`.
 #[derive(Debug, Args)]
 pub struct Report {
-    /// A sweep's folder, done or not, or a folder with runs of `tce run`.
-    directory: PathBuf,
-    /// Where report.html, report.md and report.tex go (default: the folder itself).
+    /// A sweep's folder, done or not, a folder with runs of `tce run`, a record of `tce sweep export`, or a folder of records. Several
+    /// are reported as one.
+    #[arg(required = true, value_name = "PLACE")]
+    places: Vec<PathBuf>,
+    /// Where report.html, report.md and report.tex go (default: the first place that is a folder, else the working directory).
     #[arg(long)]
     out: Option<PathBuf>,
     /// Resamples of the bootstrap behind the intervals.
@@ -40,9 +42,12 @@ impl Report {
                 self.resamples
             )));
         }
-        let study = of_directory(&self.directory)?;
+        let folder = self.places.iter().find(|p| p.is_dir()).map_or(Path::new("."), PathBuf::as_path);
+        let folder = self.out.as_deref().unwrap_or(folder);
+        tce_base::ensure_folder(folder)?;
+        let study = of_places(&self.places)?;
         let analysis = analyse(&study, &Options { resamples: self.resamples, ..Options::default() })?;
-        let files = tce_report::write(&study, &analysis, self.out.as_deref().unwrap_or(&self.directory))?;
+        let files = tce_report::write(&study, &analysis, folder)?;
         output.print(&Written { files, analysis }, render);
         Ok(())
     }

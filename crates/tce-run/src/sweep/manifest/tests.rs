@@ -98,8 +98,46 @@ fn nonsense_is_refused_before_anything_is_planned() {
     }
 }
 
+const TIERS: &str = r#"
+    tasks = ["hopper-morph:medium->expert", "hopper-morph:medium->medium"]
+    variants = ["tce-og"]
+    baselines = false
+    [[tiers]]
+    name = "first"
+    seeds = 2
+    [[tiers]]
+    name = "second"
+    seeds = 3
+    variants = ["bc", "tce-og"]
+"#;
+
 #[test]
-fn patterns_match_tasks() {
-    let count = |p: &str| tasks(&[p.into()]).unwrap().len();
-    assert_eq!((count("*"), count("hopper-*:medium->expert"), count("*-morph:medium->*")), (108, 3, 12));
+fn tiers_come_one_after_the_other_and_share_their_work() {
+    let manifest = plan(TIERS).unwrap();
+    let runs: Vec<(&str, &str, u64, String)> = manifest
+        .entries
+        .iter()
+        .filter(|e| e.kind == Kind::Run)
+        .map(|e| (e.tier.as_str(), e.variant.unwrap().name(), e.seed, e.task.target.to_string()))
+        .collect();
+    let first = |seed| [("first", "tce-og", seed, "expert".to_owned()), ("first", "tce-og", seed, "medium".to_owned())];
+    assert_eq!(runs[..4], [first(0), first(1)].concat());
+    // Seeds 0 and 1 of tce-og are done by then.
+    let bc = |seed| [("second", "bc", seed, "expert".to_owned()), ("second", "bc", seed, "medium".to_owned())];
+    assert_eq!(runs[4..8], [bc(0), bc(1)].concat());
+    assert_eq!(runs.len(), 4 + 6 + 2);
+    // A task's rows stand right before the runs that need them.
+    let kinds: Vec<Kind> = manifest.entries.iter().take(5).map(|e| e.kind).collect();
+    assert_eq!(kinds, [Kind::Source, Kind::Target, Kind::Augment, Kind::Run, Kind::Target]);
+    for entry in &manifest.entries {
+        assert!(entry.needs.iter().all(|&n| n < entry.index), "{entry}");
+    }
+    for (change, needle) in [
+        ("name = \"second\"\n    seeds = 0", "tier \"second\": there is nothing to run"),
+        ("name = \"first\"\n    seeds = 3", "found the name \"first\", expected one of its own"),
+        ("name = \"second\"\n    seeds = 30000", "tier \"second\": 4 x 30000 runs; a sweep has at most"),
+    ] {
+        let message = plan(&TIERS.replace("name = \"second\"\n    seeds = 3", change)).unwrap_err().to_string();
+        assert!(message.contains(needle), "{message}");
+    }
 }

@@ -1,4 +1,4 @@
-//! `tce sweep plan`, `launch`, `run-one`, `status` and `gather`.
+//! `tce sweep plan`, `launch`, `run-one`, `status`, `gather` and `export`.
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -31,6 +31,8 @@ pub enum SweepCommand {
     Status(StatusArgs),
     /// Verify everything that is done and make a table of it.
     Gather(Gather),
+    /// Write what was found to one small file that outlives the machine: scores, returns, settings, hashes.
+    Export(Export),
 }
 
 /// Arguments of `sweep plan`.
@@ -122,6 +124,20 @@ pub struct Gather {
     partial: bool,
 }
 
+/// Arguments of `sweep export`.
+#[derive(Debug, Args)]
+pub struct Export {
+    /// A sweep's folder, a folder with runs of `tce run`, or a record of before. Several become one record.
+    #[arg(required = true, value_name = "PLACE")]
+    places: Vec<PathBuf>,
+    /// The record, JSON Lines; `tce report` reads it.
+    #[arg(long)]
+    out: PathBuf,
+    /// Replace an existing file.
+    #[arg(long)]
+    force: bool,
+}
+
 impl SweepCommand {
     /// Runs the command.
     pub fn run(self, output: Output, save_every: f64, device: DeviceKind) -> Result<()> {
@@ -131,6 +147,7 @@ impl SweepCommand {
             SweepCommand::RunOne(args) => args.run(output, &device.device()?),
             SweepCommand::Status(args) => args.run(output),
             SweepCommand::Gather(args) => args.run(output),
+            SweepCommand::Export(args) => args.run(output),
         }
     }
 }
@@ -322,6 +339,43 @@ impl Gather {
         }
         tce_base::write_json(&self.directory.join("results.json"), &gathered)?;
         output.print(&gathered, render::gathered);
+        Ok(())
+    }
+}
+
+#[derive(Serialize)]
+struct Exported {
+    file: PathBuf,
+    bytes: u64,
+    tasks: usize,
+    runs: usize,
+    missing: usize,
+}
+
+impl Export {
+    fn run(self, output: Output) -> Result<()> {
+        // A record may be among what it is made from: it is read before it is replaced.
+        crate::commands::refuse::existing(&self.out, self.force)?;
+        let study = tce_run::study::of_places(&self.places)?;
+        if study.runs.is_empty() {
+            return Err(Error::Usage(
+                "found no finished run to export; make some with `tce sweep launch` or `tce run`".into(),
+            ));
+        }
+        tce_report::record::write(&study, &self.out)?;
+        let tasks: std::collections::BTreeSet<_> = study.runs.iter().map(|r| r.task).collect();
+        let exported = Exported {
+            bytes: std::fs::metadata(&self.out).map_or(0, |m| m.len()),
+            file: self.out,
+            tasks: tasks.len(),
+            runs: study.runs.len(),
+            missing: study.missing.len(),
+        };
+        output.print(&exported, |e| {
+            let missing = if e.missing == 0 { String::new() } else { format!(", {} more have no result", e.missing) };
+            let (file, kib) = (e.file.display(), e.bytes.div_ceil(1024));
+            format!("{file}: {} runs of {} tasks, {kib} KiB{missing}\nread it with: tce report {file}", e.runs, e.tasks)
+        });
         Ok(())
     }
 }

@@ -22,6 +22,15 @@ pub fn status(status: &Status) -> String {
     };
     let rows = status.kinds.iter().map(|(k, (done, all))| [word(k).to_owned(), format!("{done}/{all}")]);
     let mut text = format!("{}\n{}\n", status.name, table(&["work", "done"], rows));
+    if !status.tiers.is_empty() {
+        let hours = |seconds: f64| format!("{:.1} h", seconds / 3600.0);
+        let rows = status.tiers.iter().map(|t| {
+            let left = t.seconds_left.map_or("not known yet".into(), hours);
+            [t.name.clone(), format!("{}/{}", t.done, t.all), hours(t.seconds), left]
+        });
+        // One process works at one piece, so that its hours are core-hours where it has one thread.
+        text += &format!("{}\n", table(&["tier", "done", "process hours so far", "still to come"], rows));
+    }
     let left = match (status.complete(), status.seconds_left) {
         (true, _) => "all runs are done".to_owned(),
         (false, Some(s)) => format!("about {:.0} min left", (s / 60.0).ceil()),

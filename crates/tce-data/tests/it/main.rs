@@ -1,0 +1,14 @@
+//! Tests of `tce-data` from outside. One binary: linking each file by itself takes longer than the tests.
+
+mod common;
+mod episodes;
+mod files;
+mod formats;
+mod h5py;
+mod links;
+mod malformed;
+mod mixed_data;
+mod real_files;
+mod speed;
+mod styles;
+mod versions;

@@ -1,0 +1,4 @@
+//! Tests of `tce-diffusion` from outside. One binary: linking each file by itself takes longer than the tests.
+
+mod golden;
+mod model;

@@ -1,0 +1,94 @@
+//! One figure that tells where a method helps, does nothing, harms.
+
+use maud::{Markup, html};
+
+use super::{counted, one, signed, term, title_cell};
+use crate::analysis::{Analysis, Effect, Gap, LEAST, SURE};
+use crate::stats::Estimate;
+use crate::study::{agent_title, shift_title};
+use crate::svg::{self, Axis, Interval, Series};
+
+/// A panel for every method, a dot for every task; None without a method that has a baseline beside it.
+pub(super) fn effects(analysis: &Analysis) -> Option<Markup> {
+    let gaps = &analysis.gaps;
+    if gaps.is_empty() {
+        return None;
+    }
+    let methods: Vec<usize> = (0..analysis.methods.len()).filter(|m| gaps.iter().any(|g| g.method == *m)).collect();
+    let of = |m: usize| gaps.iter().filter(move |g| g.method == m);
+    let ends = gaps.iter().flat_map(|g| {
+        let reach = SURE * g.error.unwrap_or(0.0);
+        [g.points - reach, g.points + reach, 0.0]
+    });
+    let axis = Axis::around(ends, 5);
+    let effects = [Effect::Helps, Effect::Harms, Effect::Open, Effect::OneSeed];
+    Some(html! {
+        p {
+            "How many points a method is above the best " (term("baseline", "baseline")) " of each task, the one with the highest mean there. \
+             Bars are two standard errors over " (term("seed", "seeds")) " to either side; a dot without one has a single seed. A method helps or harms \
+             where the difference is more than " (SURE) " standard errors and more than " (one(LEAST)) " point."
+        }
+        div class="scroll" {
+            table {
+                thead { tr {
+                    th class="first" { "Method" } th { "Tasks" }
+                    @for effect in effects { th { (capital(effect.word())) } }
+                    th { "Mean difference" } th { "Worst" } th { "Best" }
+                } }
+                tbody { @for &m in &methods {
+                    @let points: Vec<f64> = of(m).map(|g| g.points).collect();
+                    tr {
+                        th scope="row" { (title_cell(analysis, m)) }
+                        td { (points.len()) }
+                        @for effect in effects { td { (of(m).filter(|g| g.effect == effect).count()) } }
+                        td { (signed(points.iter().sum::<f64>() / points.len() as f64)) }
+                        td { (signed(points.iter().copied().fold(f64::MAX, f64::min))) }
+                        td { (signed(points.iter().copied().fold(f64::MIN, f64::max))) }
+                    }
+                } }
+            }
+        }
+        div class="keys" { @for effect in effects { (svg::dot_key(&Series { title: effect.word().into(), class: class(effect).into() })) } }
+        div class="panels" {
+            @for &m in &methods {
+                @let rows: Vec<Interval> = of(m).map(row).collect();
+                figure {
+                    figcaption { (analysis.methods[m].title) " " span { (counted(rows.len(), "task", "tasks")) } }
+                    (svg::intervals(&format!("{} above the best baseline", analysis.methods[m].title), &rows, &axis,
+                        "points above the best baseline", Some(0.0), 1))
+                }
+            }
+        }
+    })
+}
+
+fn capital(word: &str) -> String {
+    word[..1].to_uppercase() + &word[1..]
+}
+
+fn class(effect: Effect) -> &'static str {
+    match effect {
+        Effect::Helps => "helps",
+        Effect::Harms => "harms",
+        Effect::Open => "open",
+        Effect::OneSeed => "f3",
+    }
+}
+
+fn row(gap: &Gap) -> Interval {
+    let reach = gap.error.map(|e| SURE * e);
+    Interval {
+        series: Series { title: name(gap), class: class(gap.effect).into() },
+        inner: Estimate { point: gap.points, interval: reach.map(|r| (gap.points - r, gap.points + r)) },
+        outer: None,
+    }
+}
+
+/// The task in 22 letters: `Cheetah kin. m→e`.
+fn name(gap: &Gap) -> String {
+    let shift: String = shift_title(gap.task.shift).to_lowercase().chars().take(3).collect();
+    let robot = agent_title(gap.task.agent).replace("HalfCheetah", "Cheetah");
+    let quality = |q: tce_data::Quality| q.to_string().split('-').filter_map(|w| w.chars().next()).collect::<String>();
+    let five = if gap.task.shift == tce_data::Shift::Gravity5 { " ×5" } else { "" };
+    format!("{robot} {shift}.{five} {}→{}", quality(gap.task.source), quality(gap.task.target))
+}

@@ -1,0 +1,170 @@
+//! Results without the folders that they came from: scores, returns, settings and hashes of many runs in one file.
+//!
+//! The folders of a sweep are large and belong to one machine. What they found is small: `tce sweep export` writes it to a record, and
+//! `tce report` reads records beside sweeps. A record is JSON Lines, one object a line, each with one key that tells what it is:
+//!
+//! | key | content |
+//! |---|---|
+//! | `record` | first line: version of the format, the study's name, the program that wrote it |
+//! | `method` | a column of the tables |
+//! | `config` | a configuration as TOML, and its hash |
+//! | `run` | a finished run: task, method, recipe, and all that [`RunFolder`] holds but configuration and curves |
+//! | `missing`, `conflict`, `note`, `recommended`, `cost` | as in [`Study`] |
+//!
+//! Lines have a fixed order, so that a record that gains runs changes by added lines.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use tce_base::{PROGRAM, read_if_there, write_atomically};
+use tce_data::Task;
+
+use crate::error::{ReportError, Result};
+use crate::folder::{RunFolder, config_hash};
+use crate::study::{Cost, Method, Missing, Recipe, Recommended, Run, Study, order};
+
+/// Version of the format. Increase it when older records cannot be read.
+const FORMAT: u32 = 1;
+/// What to do about a damaged record.
+const AGAIN: &str = "write the record again with `tce sweep export`, or take it back from version control";
+
+/// A line of a record; see the [module](self).
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+enum Line {
+    Record { format: u32, name: String, program: String },
+    Method(Method),
+    Config { hash: String, toml: String },
+    Run { task: Task, method: String, recipe: Recipe, folder: Box<RunFolder> },
+    Missing(Missing),
+    Conflict(String),
+    Note(String),
+    Recommended(Recommended),
+    Cost(Cost),
+}
+
+/// The first line, of any version.
+#[derive(Deserialize)]
+struct AnyRecord {
+    record: AnyHeader,
+}
+
+#[derive(Deserialize)]
+struct AnyHeader {
+    format: u32,
+    program: String,
+}
+
+/// Whether the file at `path` begins as a record does.
+pub fn is_record(path: &Path) -> bool {
+    let first = |text: Vec<u8>| {
+        let line = text.split(|b| *b == b'\n').next().unwrap_or_default();
+        serde_json::from_slice::<AnyRecord>(line).is_ok()
+    };
+    path.is_file() && read_if_there(path).ok().flatten().is_some_and(first)
+}
+
+/// The record of `study`, as text. Folders are named relative to the study's.
+pub fn to_text(study: &Study) -> String {
+    let mut lines = vec![Line::Record { format: FORMAT, name: study.name.clone(), program: PROGRAM.into() }];
+    let used =
+        |m: &&Method| study.runs.iter().any(|r| r.method == m.id) || study.missing.iter().any(|r| r.method == m.id);
+    lines.extend(study.methods.iter().filter(used).cloned().map(Line::Method));
+    let configs: BTreeMap<&str, &str> =
+        study.runs.iter().map(|r| (r.folder.config_hash.as_str(), r.folder.config.as_str())).collect();
+    lines.extend(configs.into_iter().map(|(hash, toml)| Line::Config { hash: hash.into(), toml: toml.into() }));
+    // The first member of each folder stands for all of them.
+    let mut runs: Vec<&Run> = study.runs.iter().filter(|r| r.index == 0).collect();
+    runs.sort_by_key(|r| (order(&r.task), r.method.clone(), r.member.seed, r.folder.config_hash.clone()));
+    lines.extend(runs.into_iter().map(|run| {
+        let folder = RunFolder { curves: Vec::new(), ..(*run.folder).clone() };
+        let directory = folder.directory.strip_prefix(&study.directory).unwrap_or(&folder.directory).to_owned();
+        Line::Run {
+            task: run.task,
+            method: run.method.clone(),
+            recipe: (*run.recipe).clone(),
+            folder: Box::new(RunFolder { directory, ..folder }),
+        }
+    }));
+    lines.extend(study.recommended.iter().cloned().map(Line::Recommended));
+    lines.extend(study.missing.iter().cloned().map(Line::Missing));
+    lines.extend(study.conflicts.iter().cloned().map(Line::Conflict));
+    lines.extend(study.notes.iter().cloned().map(Line::Note));
+    lines.extend(study.costs.iter().cloned().map(Line::Cost));
+    lines.iter().map(|line| serde_json::to_string(line).expect("plain data") + "\n").collect()
+}
+
+/// Writes the record of `study` to `path`, whole or not at all.
+///
+/// # Errors
+/// If the file cannot be written.
+pub fn write(study: &Study, path: &Path) -> Result<()> {
+    Ok(write_atomically(path, to_text(study).as_bytes())?)
+}
+
+/// Reads a record.
+///
+/// # Errors
+/// If there is no such file, it is damaged, or another version of the program wrote it: which line, and what was expected there.
+pub fn read(path: &Path) -> Result<Study> {
+    let nothing = |what: String| ReportError::Nothing { path: path.to_owned(), what };
+    let bytes = read_if_there(path)?.ok_or_else(|| nothing("there is no such file".into()))?;
+    let wrong = |line: usize, found: String, expected: &str| {
+        ReportError::field(path, format!("(line {line})"), found, expected, AGAIN)
+    };
+    let text = String::from_utf8(bytes).map_err(|e| wrong(1, e.to_string(), "text in UTF-8"))?;
+    let mut lines = text.lines().enumerate().map(|(n, line)| (n + 1, line));
+    let (_, first) = lines.next().ok_or_else(|| nothing(format!("the file is empty; {AGAIN}")))?;
+    let header: AnyRecord = serde_json::from_str(first)
+        .map_err(|e| wrong(1, e.to_string(), "the header of a record of `tce sweep export`"))?;
+    if header.record.format != FORMAT {
+        return Err(ReportError::field(
+            path,
+            "record.format",
+            format!("{}, written by {}", header.record.format, header.record.program),
+            FORMAT.to_string(),
+            "use that program, or write the record again with this one",
+        ));
+    }
+    let parse = |n: usize, line: &str| {
+        serde_json::from_str::<Line>(line).map_err(|e| wrong(n, e.to_string(), "a line of a record"))
+    };
+    let Line::Record { name, .. } = parse(1, first)? else { unreachable!("it was read as a header") };
+    let mut study = Study::new(name, path.display().to_string());
+    let mut configs = BTreeMap::new();
+    for (n, line) in lines {
+        match parse(n, line)? {
+            Line::Record { .. } => return Err(wrong(n, "a second header".into(), "one header, in the first line")),
+            Line::Method(method) => study.methods.push(method),
+            Line::Config { hash, toml } => {
+                if config_hash(&toml) != hash {
+                    return Err(wrong(
+                        n,
+                        format!("settings with the hash {}", config_hash(&toml)),
+                        &format!("the hash {hash}"),
+                    ));
+                }
+                configs.insert(hash, toml);
+            }
+            Line::Run { task, method, recipe, folder } => {
+                let config = configs.get(&folder.config_hash).cloned();
+                let config = config.ok_or_else(|| {
+                    let found = format!("settings {}, which no line before has", folder.config_hash);
+                    wrong(n, found, "a `config` line before the runs of these settings")
+                })?;
+                if !study.methods.iter().any(|m| m.id == method) {
+                    return Err(wrong(n, format!("method {method:?}"), "a `method` line of this id before the run"));
+                }
+                study.add(task, &method, RunFolder { config, ..*folder }, &Arc::new(recipe));
+            }
+            Line::Missing(missing) => study.missing.push(missing),
+            Line::Conflict(conflict) => study.conflicts.push(conflict),
+            Line::Note(note) => study.notes.push(note),
+            Line::Recommended(recommended) => study.recommended.push(recommended),
+            Line::Cost(cost) => study.costs.push(cost),
+        }
+    }
+    Ok(study)
+}

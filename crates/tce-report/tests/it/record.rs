@@ -1,0 +1,121 @@
+//! Records: results without the folders that they came from.
+
+use std::fs;
+use std::path::Path;
+
+use crate::common::{add, hopper, method, one_task, quick, write_folder};
+use tce_report::folder::Verdict;
+use tce_report::{Missing, Study, analyse, merge, record};
+
+const SCORES: [f64; 3] = [80.0, 81.0, 82.5];
+
+/// A study of one task, with everything that a record keeps.
+fn study(root: &Path) -> Study {
+    let mut study = one_task(root, &[("bc", "BC", &[70.0, 71.0, 72.0]), ("tce-og", "TCE(OG)", &SCORES)]);
+    study.directory = root.display().to_string();
+    study.missing.push(Missing {
+        task: hopper(),
+        method: "tce-og".into(),
+        seed: Some(7),
+        what: "tce-og, seed 7".into(),
+        why: "not done".into(),
+    });
+    study
+}
+
+/// `study` written to a record and read again.
+fn read_again(study: &Study, path: &Path) -> Study {
+    record::write(study, path).unwrap();
+    assert!(record::is_record(path));
+    record::read(path).unwrap()
+}
+
+#[test]
+fn a_record_gives_the_same_figures_as_the_folders() {
+    let root = tempfile::tempdir().unwrap();
+    let study = study(root.path());
+    let path = root.path().join("results.jsonl");
+    let again = read_again(&study, &path);
+    let figures = |s: &Study| serde_json::to_value(analyse(s, &quick()).unwrap()).unwrap();
+    assert_eq!(figures(&again), figures(&study));
+    let run = &again.runs[4];
+    assert_eq!((run.member.seed, &run.member.verdict), (1, &Verdict::Score(81.0)));
+    assert_eq!(run.member.returns, [810.0, 972.0]);
+    assert_eq!((run.folder.directory.to_str(), run.folder.config.as_str()), (Some("tce-og"), "a = 1\n"));
+    assert_eq!(run.folder.files.len(), 1, "hashes stay");
+    // Written from the record, it is the record: folders are named relative to where they were.
+    assert_eq!(record::to_text(&Study { directory: "x".into(), ..again }), fs::read_to_string(&path).unwrap());
+}
+
+#[test]
+fn runs_that_two_records_have_count_once() {
+    let root = tempfile::tempdir().unwrap();
+    let study = study(root.path());
+    let record = read_again(&study, &root.path().join("a.jsonl"));
+    let both = merge(vec![study.clone(), record.clone()]);
+    assert_eq!((both.runs.len(), both.missing.len(), both.methods.len()), (6, 1, 2));
+    assert!(both.conflicts.is_empty() && both.notes.is_empty());
+    // The run that the record lacks is in the second study, and another score of a run is a fault of determinism.
+    let mut later = one_task(&root.path().join("b"), &[("bc", "BC", &[70.0, 71.0, 73.0])]);
+    later.methods.push(method("tce-og", "TCE(OG)", false));
+    let directory = root.path().join("seven");
+    write_folder(&directory, &[(7, Some(85.0))], "a = 1\n");
+    add(&mut later, hopper(), "tce-og", &directory);
+    let both = merge(vec![record, later]);
+    assert_eq!((both.runs.len(), both.missing.len(), both.conflicts.len()), (7, 0, 1), "{:?}", both.conflicts);
+    assert!(both.conflicts[0].starts_with("bc, hopper-morph/medium/expert, seed 2: bc on "), "{:?}", both.conflicts);
+    let first: Vec<f64> = both
+        .runs
+        .iter()
+        .filter_map(|r| if let Verdict::Score(s) = r.member.verdict { Some(s) } else { None })
+        .collect();
+    assert_eq!(first, [70.0, 71.0, 72.0, 80.0, 81.0, 82.5, 85.0]);
+}
+
+#[test]
+fn other_settings_and_other_methods_of_one_name_are_columns_of_their_own() {
+    let root = tempfile::tempdir().unwrap();
+    let first = study(root.path());
+    let mut other = one_task(&root.path().join("b"), &[]);
+    other.methods = vec![method("bc", "BC", true), method("tce-og", "another thing", false)];
+    other.name = "mine".into();
+    for (id, folder) in [("bc", "b/bc"), ("tce-og", "b/og")] {
+        let directory = root.path().join(folder);
+        write_folder(&directory, &[(0, Some(50.0))], "a = 2\n");
+        add(&mut other, hopper(), id, &directory);
+    }
+    let both = merge(vec![first, other]);
+    let ids: Vec<&str> = both.methods.iter().map(|m| m.id.as_str()).collect();
+    let hash = |k: usize| both.runs[k].folder.config_hash[..6].to_owned();
+    let (own, others) = (format!("bc {}", hash(0)), format!("bc {}", hash(6)));
+    assert_ne!(own, others);
+    assert_eq!(ids, [own.as_str(), others.as_str(), "tce-og", "tce-og (mine)"]);
+    assert_eq!(both.runs[7].method, "tce-og (mine)");
+    assert!(both.notes[0].starts_with("bc: a task has several runs of one seed"), "{:?}", both.notes);
+}
+
+#[test]
+fn a_damaged_record_names_its_line() {
+    let root = tempfile::tempdir().unwrap();
+    let path = root.path().join("results.jsonl");
+    record::write(&study(root.path()), &path).unwrap();
+    let whole = fs::read_to_string(&path).unwrap();
+    let read = |text: String| {
+        fs::write(&path, text).unwrap();
+        record::read(&path).unwrap_err().to_string()
+    };
+    for (text, needles) in [
+        (whole.replace("a = 1", "a = 2"), ["line 4", "settings with the hash"]),
+        (whole.replace("\"format\":1", "\"format\":9"), ["record.format", "found 9, written by tce"]),
+        (whole.replace("{\"method\":{\"id\":\"bc\"", "{\"method\":{\"id\":\"other\""), ["line 5", "method \"bc\""]),
+        (whole.replace("{\"config\"", "{\"configuration\""), ["line 4", "configuration"]),
+        (whole[..whole.len() - 20].to_owned(), ["line 7", "EOF"]),
+        ("{}\n".into(), ["line 1", "header of a record"]),
+        (String::new(), ["the file is empty", "tce sweep export"]),
+    ] {
+        let error = read(text);
+        assert!(needles.iter().all(|n| error.contains(n)) && error.contains("results.jsonl"), "{error}");
+    }
+    assert!(!record::is_record(&root.path().join("bc/metrics.jsonl")), "metrics are none");
+    assert!(!record::is_record(root.path()));
+}
