@@ -1,8 +1,11 @@
 //! Where the data of a benchmark task come from: files, or actors that collect them.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use tce_data::{Agent, Quality, Shift, Task};
+use tce_base::sha256_file;
+use tce_data::{Agent, LoadOptions, Quality, Shift, Task, Transitions, load};
+use tce_zoo::actors::cached;
 use tce_zoo::exhibits;
 use tce_zoo::recipes::{Cast, Recipe};
 use tce_zoo::stand_ins::{self, shared_folder};
@@ -16,7 +19,8 @@ pub struct DataArgs {
     /// Source data (default: collected from the zoo's actors, or from those in TCE_SHARED where the zoo lacks one).
     #[arg(long, value_name = "FILE")]
     pub source: Option<PathBuf>,
-    /// Target data (default: OTDF's public file if TCE_SHARED has it, otherwise collected from the zoo's actors).
+    /// Target data (default: OTDF's public file if TCE_SHARED has it, a medium-expert set joined of its medium and expert files, or else rows of the
+    /// zoo's actors).
     #[arg(long, value_name = "FILE")]
     pub target: Option<PathBuf>,
     /// Do not look into TCE_SHARED: what is not given as a file is collected from the zoo.
@@ -31,8 +35,51 @@ pub struct DataArgs {
 enum Origin {
     /// A file that is there.
     File(PathBuf),
+    /// Files of which it is joined.
+    Joined(Joined),
     /// Actors that collect it.
     Collected(Recipe),
+}
+
+/// A medium-expert set of a medium and an expert one.
+struct Joined {
+    medium: PathBuf,
+    expert: PathBuf,
+}
+
+/// Trajectories of a medium-expert set, as OTDF's have them.
+const MEDIUM_TRAJECTORIES: usize = 2;
+const EXPERT_TRAJECTORIES: usize = 3;
+
+impl Joined {
+    /// Of OTDF's public files, for a task whose own file is not there.
+    fn of(task: Task) -> Option<Self> {
+        let file = |target| Task { target, ..task }.target_file(&shared_folder());
+        let joined = Self { medium: file(Quality::Medium), expert: file(Quality::Expert) };
+        (task.target == Quality::MediumExpert && joined.medium.exists() && joined.expert.exists()).then_some(joined)
+    }
+
+    /// The file with the first trajectories of both, written now unless it is there.
+    fn file(&self, task: Task, args: &DataArgs) -> Result<PathBuf> {
+        let parts = [("medium", &self.medium, MEDIUM_TRAJECTORIES), ("expert", &self.expert, EXPERT_TRAJECTORIES)];
+        let mut attributes = BTreeMap::new();
+        for (name, file, count) in parts {
+            attributes
+                .insert(name.to_owned(), format!("the first {count} trajectories of the file {}", sha256_file(file)?));
+        }
+        let dims = task.agent.dims();
+        let options = LoadOptions { dims: Some(dims), ..LoadOptions::default() };
+        let join = || {
+            let mut rows = Transitions::new(dims.0, dims.1);
+            for (_, file, count) in parts {
+                let all = load(file, &options)?.transitions;
+                let end = all.episodes().get(count - 1).map_or(all.len(), |e| e.end);
+                rows.extend(&all.select(&(0..end).collect::<Vec<_>>()));
+            }
+            Ok(rows)
+        };
+        Ok(cached(&args.out.join("data"), &data_name(task.agent, task.shift, task.target), &attributes, join)?)
+    }
 }
 
 fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
@@ -42,6 +89,9 @@ fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
         Some(path) => Ok(Origin::File(path.clone())),
         None if !args.from_zoo && public.exists() => Ok(Origin::File(public)),
         None => {
+            if let Some(joined) = Joined::of(task).filter(|_| !args.from_zoo) {
+                return Ok(Origin::Joined(joined));
+            }
             let recipe = exhibits::cast(agent, shift)?.target(agent, shift, target, 0);
             Ok(Origin::Collected(recipe.ok_or_else(|| missing(shift, target, agent, "--target"))?))
         }
@@ -60,10 +110,7 @@ fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
 /// # Errors
 /// If the zoo lacks an actor, or the rows cannot be written.
 pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
-    match target_origin(task, args)? {
-        Origin::File(path) => Ok(path),
-        Origin::Collected(recipe) => collected(&recipe, task.target, args),
-    }
+    target_origin(task, args)?.file(task, task.target, args)
 }
 
 /// The source data of a task, of which `rows` is the size of a medium set, collected now if it has to be.
@@ -71,9 +118,17 @@ pub fn target_file(task: Task, args: &DataArgs) -> Result<PathBuf> {
 /// # Errors
 /// As for [`target_file`].
 pub fn source_file(task: Task, args: &DataArgs, rows: usize) -> Result<PathBuf> {
-    match source_origin(task, args, rows)? {
-        Origin::File(path) => Ok(path),
-        Origin::Collected(recipe) => collected(&recipe, task.source, args),
+    source_origin(task, args, rows)?.file(task, task.source, args)
+}
+
+impl Origin {
+    /// The file, made now if it has to be.
+    fn file(self, task: Task, quality: Quality, args: &DataArgs) -> Result<PathBuf> {
+        match self {
+            Origin::File(path) => Ok(path),
+            Origin::Joined(joined) => joined.file(task, args),
+            Origin::Collected(recipe) => collected(&recipe, quality, args),
+        }
     }
 }
 
@@ -94,7 +149,11 @@ pub fn ensure_data(task: Task, args: &DataArgs, source_rows: Option<usize>) -> R
 }
 
 fn collected(recipe: &Recipe, quality: Quality, args: &DataArgs) -> Result<PathBuf> {
-    Ok(recipe.cached(&args.out.join("data"), &format!("{}-{}-{quality}", recipe.agent, recipe.shift))?)
+    Ok(recipe.cached(&args.out.join("data"), &data_name(recipe.agent, recipe.shift, quality))?)
+}
+
+fn data_name(agent: Agent, shift: Shift, quality: Quality) -> String {
+    format!("{agent}-{shift}-{quality}")
 }
 
 /// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo

@@ -136,18 +136,28 @@ impl Recipe {
 
     /// The file of this recipe in `directory`, collected now unless it is there.
     pub fn cached(&self, directory: &Path, name: &str) -> Result<PathBuf> {
-        let attributes = self.attributes()?;
-        let key = sha256_hex(serde_json::to_string(&attributes).expect("strings").as_bytes());
-        let path = directory.join(format!("{name}-{}.hdf5", &key[..12]));
-        Scratch::tidy(directory);
-        if !path.exists() {
-            let scratch = Scratch::new(directory)?;
-            let own = scratch.file("rows.hdf5");
-            save_d4rl(&own, &self.collect()?, &attributes, &[])?;
-            move_into_place(&own, &path)?;
-        }
-        Ok(path)
+        cached(directory, name, &self.attributes()?, || self.collect())
     }
+}
+
+/// The file in `directory` with the rows that `attributes` describe, written now by `make` unless it is there: its name is `name` and the
+/// start of their hash.
+pub fn cached(
+    directory: &Path,
+    name: &str,
+    attributes: &BTreeMap<String, String>,
+    make: impl FnOnce() -> Result<Transitions>,
+) -> Result<PathBuf> {
+    let key = sha256_hex(serde_json::to_string(attributes).expect("strings").as_bytes());
+    let path = directory.join(format!("{name}-{}.hdf5", &key[..12]));
+    Scratch::tidy(directory);
+    if !path.exists() {
+        let scratch = Scratch::new(directory)?;
+        let own = scratch.file("rows.hdf5");
+        save_d4rl(&own, &make()?, attributes, &[])?;
+        move_into_place(&own, &path)?;
+    }
+    Ok(path)
 }
 
 /// Returns of some episodes.

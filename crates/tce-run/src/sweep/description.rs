@@ -42,6 +42,9 @@ pub struct Description {
     /// Collect what is not given by the zoo's actors only.
     #[serde(default)]
     pub from_zoo: bool,
+    /// What becomes of tasks whose data cannot be had.
+    #[serde(default)]
+    pub unavailable: Unavailable,
     /// Data files of a task, relative to the description.
     #[serde(default)]
     pub data: BTreeMap<Task, Files>,
@@ -51,6 +54,17 @@ pub struct Description {
     /// Parts that are done one after the other, the most informative first; empty: one part.
     #[serde(default)]
     pub tiers: Vec<Tier>,
+}
+
+/// What becomes of tasks whose data cannot be had.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Unavailable {
+    /// Nothing is planned.
+    #[default]
+    Refuse,
+    /// They are left out, and named.
+    Skip,
 }
 
 /// A part of a sweep. What it does not say is as the description has it.

@@ -15,7 +15,7 @@ use crate::inputs::{DataArgs, ensure_data};
 use crate::layers::Layered;
 use crate::variant::Variant;
 
-use super::description::{Description, Files, Override};
+use super::description::{Description, Files, Override, Unavailable};
 
 /// Version of the format. Increase it when older manifests cannot be read.
 const FORMAT: u32 = 1;
@@ -163,29 +163,32 @@ impl Manifest {
         };
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
-        // What the data of a task are needed for: with as many source rows, or without a source.
-        let mut wanted = BTreeSet::new();
+        // Why the data of a task cannot be had, with as many source rows, or without a source.
+        let mut lacking: BTreeMap<(Task, Option<usize>), Option<String>> = BTreeMap::new();
         for part in &parts {
             for (&task, &variant) in part.tasks.iter().flat_map(|t| part.variants.iter().map(move |v| (t, v))) {
                 for Override { name, set } in &part.overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
-                    wanted.insert((task, config.needs_source().then_some(config.source.rows)));
+                    let rows = config.needs_source().then_some(config.source.rows);
+                    let lacks = || ensure_data(task, &plan.header.data_of(task), rows).err().map(|e| e.to_string());
+                    if lacking.entry((task, rows)).or_insert_with(lacks).is_some() {
+                        continue;
+                    }
                     for seed in part.seeds.clone() {
                         plan.add_run(&mut known, &part.name, (task, variant, name), &config, seed);
                     }
                 }
             }
         }
-        let lacks = |(task, rows): (Task, Option<usize>)| ensure_data(task, &plan.header.data_of(task), rows).err();
-        let lacking: BTreeSet<String> = wanted.into_iter().filter_map(lacks).map(|e| e.to_string()).collect();
+        let lacking: BTreeSet<String> = lacking.into_values().flatten().collect();
         if !lacking.is_empty() {
-            return Err(Error::Failed(format!(
-                "{}: not all data can be had:\n{}",
-                path.display(),
-                lacking.into_iter().collect::<Vec<_>>().join("\n")
-            )));
+            let list = lacking.into_iter().collect::<Vec<_>>().join("\n");
+            if description.unavailable == Unavailable::Refuse || plan.entries.is_empty() {
+                return Err(Error::Failed(format!("{}: not all data can be had:\n{list}", path.display())));
+            }
+            tce_base::note!("left out, because their data cannot be had:\n{list}");
         }
         Ok(plan.sorted())
     }

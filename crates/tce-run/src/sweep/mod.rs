@@ -31,7 +31,7 @@ pub mod slurm;
 pub mod status;
 pub mod work;
 
-pub use description::{Description, Files, Override, Tier};
+pub use description::{Description, Files, Override, Tier, Unavailable};
 pub use manifest::{Entry, Header, Kind, Manifest};
 pub use repair::Check;
 

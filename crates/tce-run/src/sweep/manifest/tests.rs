@@ -84,6 +84,19 @@ fn a_plan_reads_back_and_damage_is_noticed() {
 }
 
 #[test]
+fn tasks_without_data_are_refused_or_left_out() {
+    // The zoo has no actors of ant-gravity-5.
+    let two = "tasks = [\"hopper-morph:medium->expert\", \"ant-gravity-5:medium->medium\"]\nvariants = [\"bc\"]\nfrom_zoo = true\n";
+    let message = plan(two).unwrap_err().to_string();
+    assert!(message.contains("not all data can be had") && message.contains("ant-gravity-5"), "{message}");
+    let manifest = plan(&format!("{two}unavailable = \"skip\"\n")).unwrap();
+    assert!(manifest.entries.iter().all(|e| e.task.agent == tce_data::Agent::Hopper));
+    assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Run).count(), 5);
+    let nothing = two.replace("\"hopper-morph:medium->expert\", ", "") + "unavailable = \"skip\"\n";
+    assert!(plan(&nothing).unwrap_err().to_string().contains("not all data can be had"));
+}
+
+#[test]
 fn nonsense_is_refused_before_anything_is_planned() {
     for (text, needle) in [
         ("tasks = []\nvariants = [\"bc\"]", "tasks"),

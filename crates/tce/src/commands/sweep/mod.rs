@@ -15,7 +15,9 @@ use tce_run::sweep::slurm::{Array, Submission};
 use tce_run::sweep::{Check, Kind, Manifest, Sweep};
 
 use crate::output::{Output, fit, table};
+use estimate::TierCost;
 
+mod estimate;
 mod render;
 
 /// The commands of `sweep`.
@@ -46,6 +48,9 @@ pub struct Plan {
     /// Only tell what would be planned.
     #[arg(long)]
     dry_run: bool,
+    /// Measure this machine for some seconds, and tell how many hours of one core the work will take, by tier.
+    #[arg(long)]
+    estimate: bool,
 }
 
 /// Who does the work.
@@ -160,6 +165,9 @@ struct Planned {
     distances: usize,
     augment: usize,
     run: usize,
+    /// What it will cost, where that was asked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    costs: Option<Vec<TierCost>>,
 }
 
 impl Plan {
@@ -173,6 +181,7 @@ impl Plan {
             distances: count(Kind::Distances),
             augment: count(Kind::Augment),
             run: count(Kind::Run),
+            costs: self.estimate.then(|| estimate::costs(&manifest)).transpose()?,
             directory,
         };
         if let Some(other) = tce_run::sweep::around(&planned.directory) {
@@ -193,7 +202,18 @@ impl Plan {
                 ("generated rows", p.augment),
                 ("runs", p.run),
             ];
-            let text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
+            let mut text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
+            if let Some(costs) = &p.costs {
+                let hours = |h: f64| if h < 10.0 { format!("{h:.1}") } else { format!("{h:.0}") };
+                let all = TierCost {
+                    tier: "all".into(),
+                    pieces: costs.iter().map(|c| c.pieces).sum(),
+                    core_hours: costs.iter().map(|c| c.core_hours).sum(),
+                };
+                let rows = costs.iter().filter(|c| !c.tier.is_empty()).chain([&all]);
+                let rows = rows.map(|c| [c.tier.clone(), c.pieces.to_string(), hours(c.core_hours)]);
+                text += &format!("\n{}", table(&["tier", "pieces", "about so many core-hours"], rows));
+            }
             format!("{text}\n{}", p.directory.display())
         });
         Ok(())
