@@ -13,9 +13,9 @@ pub(crate) static LINES: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::
 
 static QUIET: AtomicBool = AtomicBool::new(false);
 
-/// Whether progress that starts from now on is shown at all.
-pub fn set_quiet(quiet: bool) {
-    QUIET.store(quiet, Ordering::Relaxed);
+/// Whether progress that starts from now on is shown at all. Returns what held before.
+pub fn set_quiet(quiet: bool) -> bool {
+    QUIET.swap(quiet, Ordering::Relaxed)
 }
 
 /// Whether progress that starts now is not shown.

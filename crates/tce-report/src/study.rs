@@ -120,6 +120,9 @@ pub struct Recommended {
     pub method: String,
     /// Whether the recommendation was sure of itself.
     pub sure: bool,
+    /// Whether it was one among policies of its seed alone.
+    #[serde(default)]
+    pub one_seed: bool,
 }
 
 /// One policy and its score.

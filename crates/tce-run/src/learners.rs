@@ -161,6 +161,11 @@ impl LearnerConfig {
         self.own().steps(self.steps, mixed)
     }
 
+    /// Rows of each update.
+    pub fn batch(&self) -> usize {
+        self.own().batch(self.batch)
+    }
+
     /// Whether the method is trained as its public code has it, where that differs from its paper; None where there is one form.
     pub fn mode(&self) -> Option<Mode> {
         self.own().mode()

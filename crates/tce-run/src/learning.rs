@@ -168,7 +168,7 @@ fn job(
     device: &Device,
 ) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
     let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
-    let buffer = Buffer::new(members, config.batch)?;
+    let buffer = Buffer::new(members, config.batch())?;
     let learner = build(&buffer, config, place, device)?;
     Ok((buffer, learner))
 }

@@ -18,6 +18,7 @@ use crate::diagnosis;
 use crate::error::{Error, Result};
 use crate::recipe::Recipes;
 use crate::sweep::gather::Checked;
+use crate::sweep::work::VERDICT;
 use crate::sweep::{Entry, Kind, Sweep};
 use crate::variant::Variant;
 
@@ -360,11 +361,15 @@ fn diagnoses(root: &Path, notes: &mut Vec<String>) -> Vec<Diagnosis> {
 /// What `tce run` recommended for the tasks under `root`.
 fn recommended(root: &Path, notes: &mut Vec<String>) -> Vec<Recommended> {
     let mut out = Vec::new();
+    let mut found: Vec<(Task, PathBuf, bool)> = Vec::new();
     for place in directories(root).unwrap_or_default() {
-        let (Some(task), path) = (task_of(&place), place.join("verdict.json")) else { continue };
-        if !path.exists() {
-            continue;
-        }
+        let Some(task) = task_of(&place) else { continue };
+        found.push((task, place.join("verdict.json"), false));
+        // Of a sweep, which recommends seed by seed.
+        let own = directories(&place).unwrap_or_default().into_iter().filter(|p| name_of(p).starts_with(VERDICT));
+        found.extend(own.map(|p| (task, p.join("verdict.json"), true)));
+    }
+    for (task, path, one_seed) in found.into_iter().filter(|(_, path, _)| path.exists()) {
         let verdict = json(&path).unwrap_or_default();
         let (Some(method), Some(policy)) = (verdict["method"].as_str(), verdict["policy"].as_str()) else {
             notes.push(format!("A recommendation is left out: {} names no method and policy.", path.display()));
@@ -379,6 +384,7 @@ fn recommended(root: &Path, notes: &mut Vec<String>) -> Vec<Recommended> {
             seed,
             method: method.to_owned(),
             sure: verdict["sure"].as_bool().unwrap_or(false),
+            one_seed,
         });
     }
     out

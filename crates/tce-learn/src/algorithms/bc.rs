@@ -6,6 +6,8 @@
 //! |---|---|---|---|
 //! | - | `actor` | deterministic, 256-256, Adam 3e-4, cosine | as the policies of IQL |
 //! | - | `dropout` | 0 | of hidden units, while it is trained: Srivastava et al. 2014 |
+//! | - | `loss` | squared | own: or the likelihood of a tanh-Gaussian policy, [`Actor::likelihood_loss`] |
+//! | - | `batch` | 0 | own: rows of each update; 0: `learner.batch` |
 //! | E | `ensemble` | 1 | own: policies whose outputs are averaged before the tanh |
 //! | - | `mixed_steps` | 0 | own: generated rows are fitted sooner than they are right, see below |
 //! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
@@ -61,7 +63,7 @@ impl Method for BcConfig {
     fn check(&self) -> Result<(), LearnError> {
         within("dropout", self.dropout, 0.0..=0.9)?;
         within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
-        if self.ensemble > 1 && self.actor.form != PolicyForm::TanhMean {
+        if self.ensemble > 1 && self.loss == CloneLoss::Squared && self.actor.form != PolicyForm::TanhMean {
             let (found, remedy) =
                 (format!("{} with actor.form {:?}", self.ensemble, self.actor.form), "choose tanh_mean");
             return Err(LearnError::invalid("ensemble", found, "1, or policies without noise of their own", remedy));
@@ -71,6 +73,10 @@ impl Method for BcConfig {
 
     fn build(&self, on: &Setup<'_>) -> Built {
         Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)))
+    }
+
+    fn batch(&self, batch: usize) -> usize {
+        if self.batch == 0 { batch } else { self.batch }
     }
 
     fn steps(&self, steps: u64, mixed: bool) -> u64 {
@@ -97,17 +103,56 @@ pub struct BcConfig {
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
     /// as without them.
     pub mixed_steps: u64,
+    /// Rows of each update. 0: `learner.batch`.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub batch: usize,
+    /// What a clone of an action costs.
+    #[serde(skip_serializing_if = "CloneLoss::is_squared")]
+    pub loss: CloneLoss,
 }
 
 impl Default for BcConfig {
     fn default() -> Self {
-        Self { actor: ActorConfig::default(), ensemble: 1, dropout: 0.0, mixed_steps: 0 }
+        Self {
+            actor: ActorConfig::default(),
+            ensemble: 1,
+            dropout: 0.0,
+            mixed_steps: 0,
+            batch: 0,
+            loss: CloneLoss::Squared,
+        }
     }
+}
+
+// Nor do those of runs that were done before there was this key.
+fn is_zero(batch: &usize) -> bool {
+    *batch == 0
 }
 
 // The keys of runs that were done before there was dropout do not name it.
 fn no_dropout(rate: &f64) -> bool {
     *rate == 0.0
+}
+
+/// β of [`Actor::likelihood_loss`], as its authors recommend it.
+const BETA: f64 = 0.5;
+
+/// What a clone of an action costs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum CloneLoss {
+    /// The policy form's own loss, see [`crate::actor`]; for `tanh_mean` the squared error.
+    #[default]
+    Squared,
+    /// The likelihood under a tanh-Gaussian policy, whose spread is learned: noisy actions count less.
+    Likelihood,
+}
+
+impl CloneLoss {
+    // The keys of runs that were done before there was a choice do not name it.
+    fn is_squared(&self) -> bool {
+        *self == Self::Squared
+    }
 }
 
 /// Behaviour cloning of a population.
@@ -116,6 +161,7 @@ pub struct Bc {
     actors: Vec<Actor>,
     members: Vec<Streams>,
     dropout: f64,
+    loss: CloneLoss,
 }
 
 impl Bc {
@@ -125,19 +171,27 @@ impl Bc {
     /// If the configuration cannot be used.
     pub fn new(buffer: &Buffer, config: &BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
         config.check()?;
+        let form = match config.loss {
+            CloneLoss::Squared => config.actor.form,
+            CloneLoss::Likelihood => PolicyForm::TanhGaussian,
+        };
+        let policy = ActorConfig { form, ..config.actor.clone() };
         let actor = |k: usize| match k {
-            0 => Actor::new(buffer, &config.actor, steps, device),
-            k => Actor::named(&format!("policy {k}"), buffer, &config.actor, steps, device),
+            0 => Actor::new(buffer, &policy, steps, device),
+            k => Actor::named(&format!("policy {k}"), buffer, &policy, steps, device),
         };
         let actors = (0..config.ensemble).map(actor).collect::<Result<_, _>>()?;
-        Ok(Self { actors, members: buffer.streams(), dropout: config.dropout })
+        Ok(Self { actors, members: buffer.streams(), dropout: config.dropout, loss: config.loss })
     }
 }
 
 /// A step of one population. Returns its loss.
-fn step(actor: &mut Actor, batch: &Minibatch, mut dropout: Vec<Dropout>, step: u64) -> Tensor<3> {
+fn step(actor: &mut Actor, batch: &Minibatch, mut dropout: Vec<Dropout>, step: u64, loss: CloneLoss) -> Tensor<3> {
     let output = actor.forward_with(batch.s.clone(), |h| Dropout::apply_members(&mut dropout, h));
-    let loss = actor.imitation_loss(&output, batch.a.clone(), None);
+    let loss = match loss {
+        CloneLoss::Squared => actor.imitation_loss(&output, batch.a.clone(), None),
+        CloneLoss::Likelihood => Actor::likelihood_loss(&output, batch.a.clone(), BETA),
+    };
     drop(output);
     let value = loss.clone().inner();
     actor.step(loss, step);
@@ -160,7 +214,7 @@ impl Learner for Bc {
             self.members.iter().map(|m| Dropout::new(self.dropout, m.indexed(&name, at))).collect()
         };
         let actors = self.actors.par_iter_mut().enumerate();
-        let losses: Vec<_> = actors.map(|(k, actor)| step(actor, batch, masks(k), at)).collect();
+        let losses: Vec<_> = actors.map(|(k, actor)| step(actor, batch, masks(k), at, self.loss)).collect();
         losses.iter().for_each(|loss| meter.record("policy_loss", loss));
     }
 

@@ -151,4 +151,9 @@ pub trait Method {
         let _ = mixed;
         steps
     }
+
+    /// Rows of each update, where `batch` were asked for.
+    fn batch(&self, batch: usize) -> usize {
+        batch
+    }
 }

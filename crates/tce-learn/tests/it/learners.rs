@@ -6,14 +6,15 @@ use std::sync::Arc;
 use crate::common::go;
 use rand::RngExt;
 use tce_base::Streams;
+use tce_base::random::fill_normal;
 use tce_data::{Standardizer, Transitions};
 use tce_learn::dmc::{Dmc, DmcConfig};
 use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, LabelConfig, LearnError, Learner, Member, Method, Mode, Place, Policy,
-    PolicyLearner, best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, LabelConfig, LearnError, Learner, Member, Method, Mode, Place,
+    Policy, PolicyLearner, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -57,6 +58,42 @@ fn cloning_learns_a_linear_policy() {
     for policy in bc.policies() {
         let a = action(&policy, &[0.4, 4.995]);
         assert!((a[0] - 0.0).abs() < 0.03 && (a[1] - 0.15).abs() < 0.03, "{a:?}");
+    }
+}
+
+/// u = .8 x + noise, wide where x > 0 and narrow elsewhere; a = tanh u.
+fn uneven_data() -> Arc<Transitions> {
+    let mut rng = Streams::new(6).stream("uneven");
+    let mut t = Transitions::new(1, 1);
+    for _ in 0..4000 {
+        let x = rng.random_range(-1.0f32..1.0);
+        let mut noise = [0.0];
+        fill_normal(&mut rng, &mut noise);
+        let u = 0.8 * x + noise[0] * if x > 0.0 { 0.6 } else { 0.1 };
+        t.push(&[x], &[u.tanh()], 0.0, &[x], false, true);
+    }
+    Arc::new(t)
+}
+
+#[test]
+fn cloning_by_likelihood_learns_mean_and_spread() {
+    let data = uneven_data();
+    let buffer = Buffer::new(vec![member(1, &data, true)], 128).unwrap();
+    let actor = ActorConfig { hidden: vec![64, 64], lr: 2e-3, ..ActorConfig::default() };
+    let config = BcConfig { actor, ensemble: 2, loss: CloneLoss::Likelihood, ..BcConfig::default() };
+    let mut bc = Bc::new(&buffer, &config, 3000, &cpu()).unwrap();
+    run(&mut bc, &buffer, 3000);
+    let policy = &bc.policies()[0];
+    for (x, spread) in [(-0.6f32, 0.1f32), (-0.3, 0.1), (0.4, 0.6), (0.7, 0.6)] {
+        let mean = action(policy, &[x])[0].atanh();
+        assert!((mean - 0.8 * x).abs() < 0.1, "mean at {x}: {mean}");
+        let rows = 2000;
+        let mut rngs: Vec<_> = (0..rows).map(|k| Streams::new(3).indexed("act", k)).collect();
+        let mut sampled = vec![0.0; rngs.len()];
+        policy.act(&vec![x; rngs.len()], Some(&mut rngs), &mut sampled);
+        let squares: f32 = sampled.iter().map(|a| (a.clamp(-0.999, 0.999).atanh() - mean).powi(2)).sum();
+        let found = (squares / rows as f32).sqrt();
+        assert!(found / spread < 1.4 && spread / found < 1.4, "spread at {x}: {found}, in the data {spread}");
     }
 }
 

@@ -30,7 +30,7 @@ pub struct Recommendation {
     pub sure: bool,
     /// What the policy scores; None if its run is not here, or has no score.
     pub score: Option<f64>,
-    /// The policy with the highest score of all that the report has for the task.
+    /// The policy with the highest score of all that the report has for the task, or for its seed where it was one of these.
     pub best: Option<Scored>,
 }
 
@@ -45,7 +45,9 @@ impl Recommendation {
 pub fn recommendations(study: &Study) -> Vec<Recommendation> {
     let title = |run: &Run| study.methods.iter().find(|m| m.id == run.method).map_or(&run.method, |m| &m.title).clone();
     let of = |r: &Recommended| {
-        let runs = || study.runs.iter().filter(|run| run.task == r.task);
+        // Of a verdict on one seed's policies the others are no rivals.
+        let candidate = |run: &&Run| run.task == r.task && (!r.one_seed || r.seed == Some(run.member.seed));
+        let runs = || study.runs.iter().filter(candidate);
         let is = |run: &&Run| {
             let name = run.folder.directory.file_name().and_then(|n| n.to_str());
             r.folder.is_some() && name == r.folder.as_deref() && r.seed == Some(run.member.seed)

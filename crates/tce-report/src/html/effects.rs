@@ -1,11 +1,12 @@
 //! One figure that tells where a method helps, does nothing, harms.
 
 use maud::{Markup, html};
+use tce_data::{Quality, Shift};
 
 use super::{counted, one, signed, term, title_cell};
 use crate::analysis::{Analysis, Effect, Gap, LEAST, SURE};
 use crate::stats::Estimate;
-use crate::study::{agent_title, shift_title};
+use crate::study::agent_title;
 use crate::svg::{self, Axis, Interval, Series};
 
 /// A panel for every method, a dot for every task; None without a method that has a baseline beside it.
@@ -84,11 +85,16 @@ fn row(gap: &Gap) -> Interval {
     }
 }
 
-/// The task in 22 letters: `Cheetah kin. m→e`.
+/// The task in few letters: `Cheetah kin. m→e`.
 fn name(gap: &Gap) -> String {
-    let shift: String = shift_title(gap.task.shift).to_lowercase().chars().take(3).collect();
+    let shift = match gap.task.shift {
+        Shift::Source => "",
+        Shift::Morph => "morph",
+        Shift::Kinematic => "kin.",
+        Shift::Gravity => "grav.",
+        Shift::Gravity5 => "grav. ×5",
+    };
     let robot = agent_title(gap.task.agent).replace("HalfCheetah", "Cheetah");
-    let quality = |q: tce_data::Quality| q.to_string().split('-').filter_map(|w| w.chars().next()).collect::<String>();
-    let five = if gap.task.shift == tce_data::Shift::Gravity5 { " ×5" } else { "" };
-    format!("{robot} {shift}.{five} {}→{}", quality(gap.task.source), quality(gap.task.target))
+    let quality = |q: Quality| q.to_string().split('-').filter_map(|w| w.chars().next()).collect::<String>();
+    format!("{robot} {shift} {}→{}", quality(gap.task.source), quality(gap.task.target))
 }

@@ -45,6 +45,9 @@ pub struct Description {
     /// What becomes of tasks whose data cannot be had.
     #[serde(default)]
     pub unavailable: Unavailable,
+    /// Whether the program recommends a policy for every task and seed, from the data alone, as `tce run` does.
+    #[serde(default)]
+    pub verdicts: bool,
     /// Data files of a task, relative to the description.
     #[serde(default)]
     pub data: BTreeMap<Task, Files>,

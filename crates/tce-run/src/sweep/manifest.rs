@@ -36,6 +36,8 @@ pub enum Kind {
     Augment,
     /// A policy and its score.
     Run,
+    /// The recommendation of one of a task's policies of one seed.
+    Verdict,
 }
 
 /// One piece of work.
@@ -85,6 +87,7 @@ impl fmt::Display for Entry {
             Kind::Distances => write!(f, "{index}: distances of source rows, {task}"),
             Kind::Augment => write!(f, "{index}: generated rows, {task}, seed {seed}"),
             Kind::Run => write!(f, "{index}: {}, {task}, seed {seed}", self.column()),
+            Kind::Verdict => write!(f, "{index}: verdict, {task}, seed {seed}"),
         }
     }
 }
@@ -166,6 +169,7 @@ impl Manifest {
         // Why the data of a task cannot be had, with as many source rows, or without a source.
         let mut lacking: BTreeMap<(Task, Option<usize>), Option<String>> = BTreeMap::new();
         for part in &parts {
+            let mut runs: BTreeMap<(Task, u64), Vec<usize>> = BTreeMap::new();
             for (&task, &variant) in part.tasks.iter().flat_map(|t| part.variants.iter().map(move |v| (t, v))) {
                 for Override { name, set } in &part.overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
@@ -177,9 +181,14 @@ impl Manifest {
                         continue;
                     }
                     for seed in part.seeds.clone() {
-                        plan.add_run(&mut known, &part.name, (task, variant, name), &config, seed);
+                        let run = plan.add_run(&mut known, &part.name, (task, variant, name), &config, seed);
+                        runs.entry((task, seed)).or_default().push(run);
                     }
                 }
+            }
+            if description.verdicts {
+                runs.into_iter()
+                    .for_each(|((task, seed), runs)| plan.add_verdict(&mut known, &part.name, task, seed, runs));
             }
         }
         let lacking: BTreeSet<String> = lacking.into_values().flatten().collect();
@@ -208,7 +217,7 @@ impl Manifest {
         (task, variant, label): (Task, Variant, &str),
         config: &Config,
         seed: u64,
-    ) {
+    ) -> usize {
         let text = config.to_keyed_toml();
         let hash = sha256_hex(text.as_bytes())[..16].to_owned();
         self.header.configs.insert(hash.clone(), text);
@@ -259,7 +268,34 @@ impl Manifest {
         }
         let spec = serde_json::json!([task, data, from_zoo, variant, label, hash, seed]);
         let run = entry(Kind::Run, spec, seed, needs);
-        self.add(known, Entry { variant: Some(variant), label: label.to_owned(), ..run });
+        self.add(known, Entry { variant: Some(variant), label: label.to_owned(), ..run })
+    }
+
+    /// The choice among the policies of `runs`, which are those of a task and a seed.
+    fn add_verdict(
+        &mut self,
+        known: &mut BTreeMap<String, usize>,
+        tier: &str,
+        task: Task,
+        seed: u64,
+        runs: Vec<usize>,
+    ) {
+        let ids: Vec<&str> = runs.iter().map(|&run| self.entries[run].id.as_str()).collect();
+        let spec = serde_json::json!({ "kind": Kind::Verdict, "spec": [task, seed, ids] });
+        let entry = Entry {
+            index: 0,
+            id: sha256_hex(spec.to_string().as_bytes())[..16].to_owned(),
+            kind: Kind::Verdict,
+            task,
+            variant: None,
+            label: String::new(),
+            seed,
+            // That of the first run: the learned dynamics are the same in all.
+            config: self.entries[runs[0]].config.clone(),
+            tier: tier.to_owned(),
+            needs: runs,
+        };
+        self.add(known, entry);
     }
 
     /// Tiers one after the other, in each one seed after the other, and for each seed task after task with what its runs need: whoever stops

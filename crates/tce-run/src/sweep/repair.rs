@@ -69,7 +69,7 @@ impl Sweep {
         match entry.kind {
             // These lie in one folder with those of other tasks.
             Kind::Source | Kind::Target => outcome.files.keys().try_for_each(|name| move_aside(&place.join(name))),
-            Kind::Distances | Kind::Augment | Kind::Run => move_aside(&place),
+            Kind::Distances | Kind::Augment | Kind::Run | Kind::Verdict => move_aside(&place),
         }
     }
 }

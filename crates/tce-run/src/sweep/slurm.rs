@@ -139,7 +139,9 @@ impl Sweep {
         let missing = self.missing()?;
         let mut arrays: Vec<Array> = Vec::new();
         let mut before: Vec<String> = Vec::new();
-        for kinds in [&[Kind::Source, Kind::Target][..], &[Kind::Distances, Kind::Augment], &[Kind::Run]] {
+        let rounds: [&[Kind]; 4] =
+            [&[Kind::Source, Kind::Target], &[Kind::Distances, Kind::Augment], &[Kind::Run], &[Kind::Verdict]];
+        for kinds in rounds {
             let due = missing.iter().filter(|e| kinds.contains(&e.kind) && !queued.contains(&e.index));
             let due: Vec<usize> = due.map(|e| e.index).collect();
             let elements: Vec<Vec<usize>> = due.chunks(options.pack.max(1)).map(<[_]>::to_vec).collect();

@@ -179,7 +179,7 @@ impl Sweep {
 impl Status {
     /// Whether nothing is left to do.
     pub fn complete(&self) -> bool {
-        self.kinds.get(&Kind::Run).is_none_or(|(done, all)| done == all)
+        [Kind::Run, Kind::Verdict].iter().all(|kind| self.kinds.get(kind).is_none_or(|(done, all)| done == all))
     }
 
     /// Whether the rest will not be done: something failed, and nothing is running.

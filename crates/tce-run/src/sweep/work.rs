@@ -13,13 +13,19 @@ use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
 use crate::augment::{augment_rows, label_models};
-use crate::config::GeneratedRows;
+use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, source_file, target_file};
+use crate::learning::policy_file;
 use crate::mixture::distances_stage;
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::pipeline::run;
 use crate::stage::files_of;
+use crate::variant::Variant;
+use crate::verdict::{Candidate, Verdict, only, recommend};
 
+/// What the folders of verdicts begin with.
+pub(crate) const VERDICT: &str = "verdict";
 /// Seconds between two heartbeats.
 const BEAT: Duration = Duration::from_secs(10);
 
@@ -218,6 +224,7 @@ impl Sweep {
                 let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), device)?;
                 (summary.scores.first().copied().flatten(), summary.directory.clone(), files_of(&summary.directory)?)
             }
+            Kind::Verdict => self.verdict(entry, &config, device)?,
         };
         Ok(Outcome {
             id: entry.id.clone(),
@@ -228,6 +235,47 @@ impl Sweep {
             memory: peak_memory(),
             program: PROGRAM.into(),
         })
+    }
+
+    /// Recommends one of the policies of the runs that `entry` needs; the verdict lies beside them.
+    fn verdict(
+        &self,
+        entry: &Entry,
+        config: &Config,
+        device: &Device,
+    ) -> Result<(Option<f64>, PathBuf, BTreeMap<String, String>)> {
+        let root = self.data(entry).out;
+        let mut candidates = Vec::new();
+        let mut widest = None;
+        for run in entry.needs.iter().map(|&n| &self.entries()[n]) {
+            let done = self.outcome(run)?.ok_or_else(|| {
+                Error::Failed(format!("{run} is not done, and the verdict needs its policy; launch the sweep again"))
+            })?;
+            let own = self.manifest.config(run)?;
+            let variant = run.variant.expect("a run has a variant");
+            let title = match run.label.as_str() {
+                "" => variant.row_title(&own),
+                label => format!("{}, {label}", variant.row_title(&own)),
+            };
+            candidates.push(Candidate {
+                name: title,
+                baseline: Variant::BASELINES.contains(&variant),
+                files: vec![self.directory.join(&done.place).join(policy_file(run.seed))],
+            });
+            widest = widest.or(own.needs_source().then_some(own));
+        }
+        let inputs = Inputs::of_config(entry.task, &self.data(entry), widest.as_ref().unwrap_or(config))?;
+        let evaluator = || OffPolicyEvaluator::train(&inputs, &config.dynamics, &root, device);
+        let verdict = only(&candidates).map_or_else(|| recommend(evaluator, &candidates, None), Ok)?;
+        let task = root.join(entry.task.directory());
+        let place = task.join(format!("{VERDICT}-seed{}-{}", entry.seed, &entry.id[..12]));
+        fs::create_dir_all(&place).map_err(|e| FileError::new(&place, "create the directory", e))?;
+        // Relative to the task's folder, as that of `tce run` is.
+        let policy = verdict.policy.strip_prefix(&task).unwrap_or(&verdict.policy).to_owned();
+        let file = place.join("verdict.json");
+        write_json(&file, &Verdict { policy, ..verdict })?;
+        let files = BTreeMap::from([("verdict.json".to_owned(), sha256_file(&file)?)]);
+        Ok((None, place, files))
     }
 
     /// Makes `outcome` the work's outcome, unless a copy of the work was first.

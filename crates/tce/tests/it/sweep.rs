@@ -16,7 +16,10 @@ use tce_base::Streams;
 fn a_sweep_ends_with_every_result_right() {
     let dir = tempfile::tempdir().unwrap();
     let file = describe(dir.path(), "mine", 2);
+    let text = fs::read_to_string(dir.path().join(&file)).unwrap();
+    fs::write(dir.path().join(&file), text + "verdicts = true\n").unwrap();
     let planned = tce_json(dir.path(), &["sweep", "plan", &file]);
+    assert_eq!(planned["verdict"], 2);
     assert_eq!(
         (&planned["run"], &planned["augment"], &planned["source"], &planned["target"]),
         (&6.into(), &2.into(), &1.into(), &1.into())
@@ -32,9 +35,21 @@ fn a_sweep_ends_with_every_result_right() {
     assert!(message(&early).contains("6 not done"), "{}", message(&early));
     let status = tce_json(dir.path(), &["sweep", "launch", folder, "--workers", "2"]);
     assert_eq!(status["kinds"]["run"], serde_json::json!([6, 6]));
+    assert_eq!(status["kinds"]["verdict"], serde_json::json!([2, 2]));
     assert_eq!(status["running"], serde_json::json!([]));
     let gathered = tce_json(dir.path(), &["sweep", "gather", folder]);
     assert_eq!(gathered["rows"].as_array().unwrap().len(), 6);
+
+    // Of each seed one policy is recommended, and the best one of that seed is what it is held against.
+    let report = tce_json(dir.path(), &["report", folder, "--resamples", "100"]);
+    let recommended = report["recommendations"].as_array().unwrap();
+    let seeds: Vec<u64> = recommended.iter().map(|r| r["seed"].as_u64().unwrap()).collect();
+    assert_eq!(seeds.len(), 2);
+    assert!(seeds.contains(&0) && seeds.contains(&1), "{recommended:?}");
+    for one in recommended {
+        assert_eq!(one["best"]["seed"], one["seed"]);
+        assert!(one["best"]["score"].as_f64() >= one["score"].as_f64() && one["score"].is_number(), "{one}");
+    }
 
     // A run of a sweep is a run like any other.
     let alone = {

@@ -41,7 +41,10 @@ impl Rates {
         if let Some(rate) = self.known.get(name) {
             return Ok(units / rate);
         }
-        let measured = measure(name, 1, SECONDS, &self.on)?;
+        let before = tce_base::set_quiet(true);
+        let measured = measure(name, 1, SECONDS, &self.on);
+        tce_base::set_quiet(before);
+        let measured = measured?;
         let rate = measured.per_second / rayon::current_num_threads() as f64;
         self.known.insert(name.to_owned(), rate);
         Ok(units / rate)
@@ -58,6 +61,10 @@ impl Rates {
             }
             Kind::Augment => self.augmentation(config)?,
             Kind::Run => self.training(config)? + self.evaluation(&environment, config)?,
+            Kind::Verdict => {
+                let d = &config.dynamics;
+                self.seconds("bc", d.steps as f64 * d.members as f64 * d.batch as f64 / 256.0)?
+            }
         })
     }
 

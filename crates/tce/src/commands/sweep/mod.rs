@@ -165,6 +165,7 @@ struct Planned {
     distances: usize,
     augment: usize,
     run: usize,
+    verdict: usize,
     /// What it will cost, where that was asked.
     #[serde(skip_serializing_if = "Option::is_none")]
     costs: Option<Vec<TierCost>>,
@@ -181,6 +182,7 @@ impl Plan {
             distances: count(Kind::Distances),
             augment: count(Kind::Augment),
             run: count(Kind::Run),
+            verdict: count(Kind::Verdict),
             costs: self.estimate.then(|| estimate::costs(&manifest)).transpose()?,
             directory,
         };
@@ -201,6 +203,7 @@ impl Plan {
                 ("distances", p.distances),
                 ("generated rows", p.augment),
                 ("runs", p.run),
+                ("verdicts", p.verdict),
             ];
             let mut text = table(&["work", "pieces"], rows.map(|(what, n)| [what.to_owned(), n.to_string()]));
             if let Some(costs) = &p.costs {

@@ -19,6 +19,7 @@ pub fn status(status: &Status) -> String {
         Kind::Distances => "distances",
         Kind::Augment => "generated rows",
         Kind::Run => "runs",
+        Kind::Verdict => "verdicts",
     };
     let rows = status.kinds.iter().map(|(k, (done, all))| [word(k).to_owned(), format!("{done}/{all}")]);
     let mut text = format!("{}\n{}\n", status.name, table(&["work", "done"], rows));
