@@ -1,13 +1,13 @@
-//! The units of actions: people's torques, volts and pedals, and the box [-1, 1] in which everything here is learned.
+//! Units of actions: the user's (torques, volts, pedals) and the box [-1, 1], in which everything here is learned.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Transitions;
 
-/// Actions may leave the box [-1, 1] by this much: float32 rounding of a tanh.
+/// Actions may leave the box [-1, 1] by this much, because a tanh is rounded to float32.
 pub(crate) const ACTION_TOLERANCE: f32 = 1e-4;
 
-/// Least and greatest action of every column, in the user's units. Inside the program, `low` is -1 and `high` is 1.
+/// Smallest and largest action of every column, in the user's units. Inside the program, `low` is -1 and `high` is 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActionRange {
@@ -18,10 +18,11 @@ pub struct ActionRange {
 }
 
 impl ActionRange {
-    /// The range of the actions of `tables`; None where all of them are in [-1, 1] already.
+    /// The action range of `tables`; `None` if all actions are already in [-1, 1].
     ///
-    /// A column within [-1, 1] keeps that range: it is what the controller takes, whether or not the log went to its ends. Any other
-    /// column has the range of the data, and a symmetric one where it reaches at least half as far to the one side as to the other.
+    /// A column within [-1, 1] keeps that range: the controller takes it, even if the log does not reach both ends.
+    /// Other columns get the range of the data. It is made symmetric if one side reaches at least half as far as the
+    /// other.
     pub fn of(tables: &[&Transitions]) -> Option<Self> {
         let dim = tables.first()?.act_dim;
         let (mut low, mut high) = (vec![f32::INFINITY; dim], vec![f32::NEG_INFINITY; dim]);
@@ -37,7 +38,7 @@ impl ActionRange {
             } else if *low < 0.0 && *high > 0.0 && least >= 0.5 * greatest {
                 (*low, *high) = (-greatest, greatest);
             } else if *high - *low <= f32::EPSILON * greatest {
-                // A constant column: its one value is the middle.
+                // A constant column: its one value becomes the middle.
                 (*low, *high) = (*low - greatest, *high + greatest);
             }
         }
@@ -45,18 +46,18 @@ impl ActionRange {
         (!range.is_unit()).then_some(range)
     }
 
-    /// Whether this is the box [-1, 1] itself.
+    /// Whether this range is the box [-1, 1].
     pub fn is_unit(&self) -> bool {
         self.low.iter().all(|&x| x == -1.0) && self.high.iter().all(|&x| x == 1.0)
     }
 
-    /// Whether it can be a range of `dim` columns: finite numbers, `low` below `high`.
+    /// Whether this is a valid range of `dim` columns: finite numbers, `low` below `high`.
     pub fn fits(&self, dim: usize) -> bool {
         let pairs = self.low.iter().zip(&self.high);
         self.low.len() == dim && self.high.len() == dim && pairs.clone().all(|(l, h)| l < h && (h - l).is_finite())
     }
 
-    /// How many values of `actions` `[N, act_dim]` lie outside, by more than rounding.
+    /// Number of values of `actions` `[N, act_dim]` outside the range by more than rounding.
     pub fn outside(&self, actions: &[f32]) -> usize {
         let out = |(a, (low, high)): (&f32, (&f32, &f32))| {
             let margin = ACTION_TOLERANCE * (high - low);
@@ -66,8 +67,8 @@ impl ActionRange {
         actions.chunks_exact(self.low.len()).map(row).sum()
     }
 
-    /// The columns, by number, whose greatest value is more than ten times what 99.9 % of the values are: one wild value makes all others
-    /// small.
+    /// Indices of the columns whose largest value is more than ten times the 99.9 % quantile. After scaling to [-1, 1],
+    /// a single outlier makes all other values small.
     pub fn with_outliers(tables: &[&Transitions]) -> Vec<usize> {
         let dim = tables.first().map_or(0, |t| t.act_dim);
         let wild = |d: &usize| {
@@ -83,12 +84,12 @@ impl ActionRange {
         (0..dim).filter(wild).collect()
     }
 
-    /// From the user's units to the box, `actions` `[N, act_dim]`.
+    /// Converts `actions` `[N, act_dim]` from the user's units to the box.
     pub fn to_unit(&self, actions: &mut [f32]) {
         self.each(actions, |a, low, high| 2.0 * (a - low) / (high - low) - 1.0);
     }
 
-    /// From the box to the user's units, `actions` `[N, act_dim]`.
+    /// Converts `actions` `[N, act_dim]` from the box to the user's units.
     pub fn to_own(&self, actions: &mut [f32]) {
         self.each(actions, |a, low, high| low + (a + 1.0) * 0.5 * (high - low));
     }
@@ -131,7 +132,7 @@ mod tests {
         let r = range(&[[-19.5, 0.3]], &[[20.0, -0.3]]);
         assert_eq!(r, ActionRange { low: vec![-20.0, -1.0], high: vec![20.0, 1.0] });
         assert_eq!(r.to_string(), "-20:20,-1:1");
-        // A pedal, and a valve that never moved.
+        // Columns: a pedal, and a valve that never moved.
         let r = range(&[[0.0, 7.0]], &[[10.0, 7.0]]);
         assert_eq!((r.low[0], r.high[0]), (0.0, 10.0));
         let mut action = [10.0, 7.0];

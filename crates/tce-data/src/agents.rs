@@ -1,28 +1,28 @@
-//! Which robot a data set is of, told by its numbers.
+//! Infers from its numbers which robot a data set belongs to.
 
 use crate::{Agent, Transitions};
 
-/// Ant's observation ends with this many contact forces, which the benchmark's MuJoCo leaves at zero.
+/// Ant's observation ends with this many contact forces, which MuJoCo leaves at zero in the benchmark.
 pub(crate) const ANT_ZEROS: usize = 84;
 
-/// Source and target are not data of the same robot.
+/// Source and target are data of different robots.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "source and target are of different robots: found a source of {source_agent}, a target of {target_agent}; expected the same state \
      and action space. Choose files of the same robot"
 )]
 pub struct AgentMismatch {
-    /// What the source looks like.
+    /// Description of the source's robot.
     pub source_agent: String,
-    /// What the target looks like.
+    /// Description of the target's robot.
     pub target_agent: String,
 }
 
-/// The benchmark agents that `data` may be of; empty for anybody's own robot.
+/// The benchmark agents that `data` may belong to; empty for the user's own robot.
 ///
-/// Dimensions decide, except between HalfCheetah and Walker2d (both 17 and 6): Walker2d's first coordinate is its
-/// height, .8 to 2 on every row, and its velocities are clipped to ±10; HalfCheetah's is a height around -.1. Where
-/// neither fits cleanly (generated rows), both are returned. An Ant must have its 84 zeros.
+/// The dimensions decide, except between HalfCheetah and Walker2d (both 17 and 6). The first coordinate of both is a
+/// height: Walker2d's is .8 to 2 on every row, HalfCheetah's is around -.1. Walker2d's velocities are clipped to ±10.
+/// If neither fits cleanly (generated rows), both are returned. An Ant must have its 84 zeros.
 pub fn infer_agents(data: &Transitions) -> Vec<Agent> {
     match (data.obs_dim, data.act_dim) {
         (11, 3) => vec![Agent::Hopper],
@@ -44,15 +44,15 @@ pub fn infer_agents(data: &Transitions) -> Vec<Agent> {
     }
 }
 
-/// In words: the agents that `data` may be of, and its dimensions.
+/// Describes in words the agents that `data` may belong to, and its dimensions.
 pub(crate) fn describe(data: &Transitions) -> String {
     let names: Vec<&str> = infer_agents(data).into_iter().map(Agent::name).collect();
     let name = if names.is_empty() { "none of the benchmark's".to_owned() } else { names.join(" or ") };
     format!("{name} ({} observations, {} actions)", data.obs_dim, data.act_dim)
 }
 
-/// Refuses a source and a target of different robots: their dimensions differ, or `named` is a robot of the benchmark and one of the
-/// files looks like another. Nobody's own robot is taken for one of the benchmark's.
+/// Returns an error if source and target are of different robots: their dimensions differ, or `named` is a robot of the
+/// benchmark and one of the files looks like another robot. A user's own robot is never taken for a benchmark robot.
 pub fn ensure_same_agent(
     source: &Transitions,
     target: &Transitions,
@@ -134,7 +134,7 @@ pub(crate) mod tests {
             ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 3), None).unwrap_err().to_string();
         assert!(message.contains("4 observations and 2 actions"), "{message}");
         assert!(ensure_same_agent(&Transitions::new(4, 2), &Transitions::new(4, 2), None).is_ok());
-        // A 17 x 6 arm whose base is turned.
+        // The 17 x 6 data of a user's own robot arm, whose base is turned.
         let (a, b) = (looks_like(Agent::Walker2d), looks_like(Agent::HalfCheetah));
         assert!(ensure_same_agent(&a, &b, None).is_ok());
     }

@@ -1,4 +1,4 @@
-//! Checks of a data set that need no simulator.
+//! Checks of a data set that run without a simulator.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -11,26 +11,26 @@ use crate::agents::{ANT_ZEROS, describe, infer_agents};
 use crate::moments::Moments;
 use crate::{ActionRange, Agent, Rows, Support, Transitions};
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Worth knowing.
+    /// For information.
     Note,
-    /// Probably not what was meant.
+    /// Probably a mistake.
     Warning,
     /// The data cannot be used for this agent.
     Error,
 }
 
-/// One thing that was noticed.
+/// One finding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// How bad it is.
+    /// Severity of the finding.
     pub severity: Severity,
-    /// Which column.
+    /// The column that it concerns.
     pub field: &'static str,
-    /// What was found, what was expected, what to do.
+    /// What was found, what was expected and what to do.
     pub message: String,
 }
 
@@ -48,20 +48,20 @@ impl fmt::Display for Finding {
 /// The result of [`check()`].
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Check {
-    /// Everything noticed, in the order of the columns.
+    /// All findings, in the order of the columns.
     pub findings: Vec<Finding>,
-    /// Share of rows whose (s, a, s') an earlier row already has, 0..1.
+    /// Share of rows whose (s, a, s') repeats an earlier row, 0..1.
     pub duplicate_share: f64,
 }
 
 impl Check {
-    /// Whether there is no error.
+    /// Whether there are no errors.
     pub fn is_ok(&self) -> bool {
         self.findings.iter().all(|f| f.severity != Severity::Error)
     }
 }
 
-/// Checks `data`, expected to be of `agent` (`None`: anybody's own robot).
+/// Checks `data`, which should belong to `agent` (`None`: the user's own robot).
 pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
     let mut findings = Vec::new();
     let mut add = |severity, field, message: String| findings.push(Finding { severity, field, message });
@@ -119,7 +119,7 @@ pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
         let message = format!("every reward is {}; returns tell nothing of how good an episode is", data.rewards[0]);
         add(Severity::Note, "rewards", message);
     }
-    // Constant columns have a finding of their own.
+    // Constant columns are reported separately.
     let support = Support { constants: Vec::new(), ..Support::fit(&[&data.observations], data.obs_dim) };
     support.describe().into_iter().for_each(|line| add(Severity::Note, "observations", line));
     let single = data.episodes().iter().filter(|e| e.end - e.start == 1).count();
@@ -137,7 +137,7 @@ pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
     Check { findings, duplicate_share }
 }
 
-/// Compares the dimensions without any spread with those the agent is known to have.
+/// Compares the constant dimensions with those that are known to be constant for this agent.
 fn dead_dimensions(data: &Transitions, agent: Option<Agent>) -> Option<(Severity, String)> {
     let m = Moments::of(&[Rows::new(&data.observations, data.obs_dim)]);
     let dead: Vec<usize> = (0..data.obs_dim).filter(|&d| m.std[d] == 0.0).collect();
@@ -162,7 +162,7 @@ fn dead_dimensions(data: &Transitions, agent: Option<Agent>) -> Option<(Severity
     Some((if agent.is_some() { Severity::Warning } else { Severity::Note }, message))
 }
 
-/// In words: which actions leave the box [-1, 1] by more than float32 rounding. `None` if none does.
+/// Describes in words which actions leave the box [-1, 1] by more than float32 rounding. `None` if none does.
 fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
     let outside = |x: &&f32| x.abs() > 1.0 + ACTION_TOLERANCE;
     let count = actions.iter().filter(outside).count();
@@ -180,7 +180,7 @@ fn duplicate_share(data: &Transitions) -> f64 {
     let rows = Rows::transitions(data);
     let mut row = vec![0f32; rows.dim()];
     let mut seen = HashSet::with_capacity(rows.len());
-    // 64 bits: among two million different rows, a false match has probability 1e-7.
+    // The hash has 64 bits: among two million different rows, a false match has probability 1e-7.
     let repeated = (0..rows.len())
         .filter(|&i| {
             rows.copy_row(i, &mut row);

@@ -1,5 +1,5 @@
-//! How much nearer a row lies to the target data than to the source data: DmC's nearest-neighbour estimate of a density
-//! ratio, as a score in (0, 1].
+//! Scores in (0, 1] that say how much closer a row is to the target data than to the source data. The score comes from
+//! DmC's nearest-neighbour estimate of a density ratio.
 //!
 //! ```text
 //! ρ(x)     = ln D(x → tar) − ln D(x → src)       D = d² (faiss gives squares) or d, d the L2 distance to the k-th neighbour
@@ -12,15 +12,16 @@
 //! | D | `squared` | true | DmC: faiss' L2 index returns squares |
 //! | - | `reference` | 50 000 | own: source rows that stand for all of them; DmC: all |
 //!
-//! **A row and itself.** The published index answers a query with the row itself, at distance 0, where the row is part of the
-//! index: of a row's own set, index 4 is the 4th *other* row. So it is here: a source row is compared with its 4th other source
-//! row, whether or not it was drawn into the reference.
+//! **A row as its own neighbour.** The published index contains the source rows. It therefore returns a source row as
+//! its own nearest neighbour, at distance 0, and index 4 of a row's own set is the 4th *other* row. The same holds
+//! here: a source row is compared with its 4th other source row, whether or not it was drawn into the reference.
 //!
-//! **Thinning.** With m of n source rows at random, the k-th neighbour lies about where the (k n / m)-th lay: in d dimensions
-//! ln d_k grows by ln(n / m) / d wherever the density is even over that distance. A constant cancels in ρ − min ρ.
+//! **Thinning.** With m of n source rows drawn at random, the k-th neighbour lies about where the (k n / m)-th was: in
+//! d dimensions ln d_k grows by ln(n / m) / d wherever the density is even over that distance. Constants cancel in ρ −
+//! min ρ.
 //!
-//! **Copies.** A row that has k copies has distance 0 and no logarithm: it counts as if it were at the smallest distance that
-//! is not 0.
+//! **Copies.** A row with k copies has distance 0, which has no logarithm. Its distance is replaced by the smallest
+//! distance that is not 0.
 
 use serde::{Deserialize, Serialize};
 
@@ -49,11 +50,11 @@ impl Default for DensityOptions {
     }
 }
 
-/// What the scores of source rows have in common, and with it the scores of further rows.
+/// What all source rows' scores share. Scores of further rows can be computed from it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DensityScale {
-    /// min ρ, rounded up: numbers that a file gives back as they were.
+    /// min ρ, rounded up to a number that a file stores without change.
     pub least: f32,
     /// The smallest distance to the target that is not 0.
     pub target_floor: f32,
@@ -61,7 +62,7 @@ pub struct DensityScale {
     pub source_floor: f32,
 }
 
-/// The scores of source rows.
+/// Scores of the source rows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityScores {
     /// `[source.len()]`
@@ -70,9 +71,9 @@ pub struct DensityScores {
     pub scale: DensityScale,
 }
 
-/// The scores of all source rows (points [s, a, s'], in DmC, as stored).
+/// The scores of all source rows. Points are [s, a, s'], in stored units as in DmC.
 ///
-/// The reference comes from the stream `density/reference`. Independent of the number of threads.
+/// The reference is drawn from the stream `density/reference`. The result is independent of the number of threads.
 ///
 /// # Errors
 /// [`DataError::Interrupted`].
@@ -92,7 +93,7 @@ pub fn density_scores(
     let own = match &reference.indices {
         None => nn_distances(source, source, &at(k))?,
         Some(indices) => {
-            // A row of the reference finds itself there, another one does not.
+            // A row of the reference finds itself there; any other row does not.
             let mut own = nn_distances(source, &points, &at(k - 1))?;
             let drawn = nn_distances(&points, &points, &at(k))?;
             indices.iter().zip(drawn).for_each(|(&i, d)| own[i] = d);
@@ -110,8 +111,8 @@ pub fn density_scores(
     Ok(DensityScores { source: ratios.into_iter().map(|rho| scale.score(rho)).collect(), scale })
 }
 
-/// The scores, on the `scale` of the source rows, of rows that are in neither set: generated ones. A ρ below the least counts as
-/// the least: these rows have score 1.
+/// The scores of rows that are in neither set (generated rows), on the `scale` of the source rows. A ρ below the
+/// smallest one of the source rows is replaced by that one, so such a row has score 1.
 ///
 /// # Errors
 /// [`DataError::Interrupted`].
@@ -138,7 +139,7 @@ fn at(k: usize) -> NeighbourOptions {
     NeighbourOptions { units: Units::Raw, k }
 }
 
-/// The smallest distance that is not 0; 1 where all are.
+/// The smallest distance that is not 0; 1 if all are 0.
 fn floor(distances: &[f32]) -> f32 {
     let least = distances.iter().filter(|d| **d > 0.0).fold(f32::INFINITY, |a, &b| a.min(b));
     if least.is_finite() { least } else { 1.0 }
@@ -157,11 +158,11 @@ impl DensityScale {
     }
 }
 
-/// The source rows that stand for all.
+/// The source rows that represent the whole source.
 struct Reference {
-    /// Row-major; empty where all rows are used as they are.
+    /// Row-major; empty if all rows are used unchanged.
     points: Vec<f32>,
-    /// Which they are, ascending; `None`: all.
+    /// Their indices, ascending; `None`: all rows.
     indices: Option<Vec<usize>>,
 }
 
@@ -190,7 +191,7 @@ mod tests {
         x
     }
 
-    /// ρ of every row of `rows` by comparing all pairs; `own`: the index of row 0 in the source, or none.
+    /// ρ of every row of `rows` by comparing all pairs. `own`: the index of row 0 in the source, or `None`.
     fn brute(rows: &[f32], source: &[f32], target: &[f32], dim: usize, k: usize) -> Vec<f64> {
         let kth = |x: &[f32], set: &[f32]| {
             let square = |y: &[f32]| x.iter().zip(y).map(|(a, b)| (*a as f64 - *b as f64).powi(2)).sum::<f64>();
@@ -221,7 +222,7 @@ mod tests {
             assert!(((1.0 / a - 1.0) - 2.0 * (1.0 / b - 1.0)).abs() < 1e-4);
         }
 
-        // Further rows know no row that is themselves; target-like ones are beyond the best source row, and count as it.
+        // Further rows do not find themselves. Rows more target-like than the best source row get its score.
         let more = normal("more", 50, 3, 0.5, 1.0);
         let further = further_scores(&Rows::new(&more, 3), &s, &t, &scores.scale, &options, &streams).unwrap();
         for (score, rho) in further.iter().zip(brute(&more, &source, &target, 3, 5)) {
@@ -229,8 +230,8 @@ mod tests {
         }
     }
 
-    /// Source N(0, I), target N(1, ¼ I) in the plane: the true ln(p_tar / p_src) is known, and so is what thinning may change:
-    /// ln d_k by ln(n / m) / 2 in the plane, the same for all rows.
+    /// Source N(0, I), target N(1, ¼ I) in the plane. The true ln(p_tar / p_src) is known. Thinning may only shift ln
+    /// d_k by ln(n / m) / 2 in the plane, the same for all rows.
     #[test]
     fn a_thinned_source_shifts_all_ratios_by_one_constant() {
         let (n, dim) = (20_000, 2);
@@ -244,7 +245,7 @@ mod tests {
             rho
         };
         let (exact, thinned) = (rho(n), rho(n / 8));
-        // Where there are rows to be near to: within two of the source's standard deviations.
+        // Only rows with close neighbours: within two of the source's standard deviations.
         let inner: Vec<usize> = (0..n).filter(|&i| source[2 * i..2 * i + 2].iter().all(|x| x.abs() < 2.0)).collect();
         let moments = |values: &[f64]| {
             let mean = values.iter().sum::<f64>() / values.len() as f64;
@@ -253,10 +254,10 @@ mod tests {
         let shift: Vec<f64> = inner.iter().map(|&i| exact[i] - thinned[i]).collect();
         let (mean, std) = moments(&shift);
         assert!((mean - 8f64.ln() / dim as f64).abs() < 0.06, "{mean} instead of {}", 8f64.ln() / dim as f64);
-        // Per row there is the noise of a 10th neighbour, once in either: √(2 ψ'(10)) / 2 = .23.
+        // Each row has the noise of a 10th neighbour, once in each estimate: √(2 ψ'(10)) / 2 = .23.
         assert!(std < 0.25, "{std}");
 
-        // Both are estimates of the true ratio, −ln(p_tar / p_src) / 2 up to a constant.
+        // Both estimate the true ratio, −ln(p_tar / p_src) / 2 up to a constant.
         let truth = |i: usize| -> f64 {
             let x = &source[2 * i..2 * i + 2];
             x.iter().map(|&x| (x as f64 - 1.0).powi(2) / 0.25 / 2.0 - (x as f64).powi(2) / 2.0).sum::<f64>() / 2.0
@@ -272,7 +273,7 @@ mod tests {
     fn a_row_is_its_own_neighbour_once_wherever_it_was_drawn() {
         let source = normal("s", 600, 2, 0.0, 1.0);
         let (s, t) = (Rows::new(&source, 2), Rows::new(&source, 2));
-        // Thinned to all but one row, the rows of the reference must not differ from the one that was left out.
+        // With all rows but one in the reference, a score must not depend on whether the row is in it.
         let exact = DensityOptions { reference: 600, ..DensityOptions::default() };
         let thin = DensityOptions { reference: 599, ..exact };
         let [a, b] = [exact, thin].map(|o| density_scores(&s, &t, &o, &Streams::new(1)).unwrap());

@@ -1,60 +1,60 @@
-//! What can be wrong with a data set or its file, in one form: where, what was found, what was expected, what to do.
+//! Errors of data sets and files. All have one form: where, what was found, what was expected, what to do.
 
 use std::path::{Path, PathBuf};
 
 use tce_base::FileError;
 
-/// The kind of a [`DataError::Invalid`], for programs; people read its message.
+/// The kind of a [`DataError::Invalid`]. Programs read the kind, people read the message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Problem {
     /// Zero bytes, or no rows.
     Empty,
     /// The HDF5 signature is missing.
     NotHdf5,
-    /// The file ends before the length in its own header.
+    /// The file is shorter than the length in its own header.
     Truncated,
     /// The bytes contradict the HDF5 format.
     Malformed,
-    /// A data set that the layout needs is not there.
+    /// A data set that the layout needs is absent.
     MissingField,
-    /// Neither `(N,)`, `(N, 1)` nor, for observations and actions, `(N, D)`.
+    /// Not of shape `(N,)` or `(N, 1)`, or, for observations and actions, `(N, D)`.
     WrongRank,
     /// Not a number type.
     WrongType,
-    /// Two fields disagree about the number of rows.
+    /// Two fields have different numbers of rows.
     RowCount,
-    /// Two fields, or a field and the agent, disagree about a dimension.
+    /// Two fields, or a field and the agent, have different dimensions.
     Dimension,
     /// NaN or infinity.
     NonFinite,
-    /// A number outside of what the field may hold.
+    /// A number outside the range of the field.
     Value,
-    /// The file announces far more data than its bytes can hold.
+    /// The header declares far more data than the file's bytes can hold.
     Oversized,
-    /// Right HDF5 in a form that is not read: a compression, another file's data.
+    /// Valid HDF5 in an unsupported form: a compression, data in another file.
     Unsupported,
 }
 
 /// Why a data set was refused or could not be written.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
-    /// The content is not usable.
+    /// The content cannot be used.
     #[error("{}: field `{field}`: found {found}; expected {expected}. {advice}", file.display())]
     Invalid {
-        /// What kind of problem.
+        /// The kind of problem.
         problem: Problem,
         /// The file.
         file: PathBuf,
-        /// The HDF5 data set, or `file` for the file as a whole.
+        /// The HDF5 data set, or `file` if the whole file is meant.
         field: Box<str>,
-        /// What is there.
+        /// What was found.
         found: String,
-        /// What should be there.
+        /// What was expected.
         expected: String,
         /// What the user can do.
         advice: Box<str>,
     },
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error(transparent)]
     File(#[from] FileError),
     /// The user asked to stop.
@@ -81,7 +81,7 @@ impl DataError {
         }
     }
 
-    /// The kind of an invalid content, `None` for the other errors.
+    /// The kind of invalid content; `None` for the other errors.
     pub fn problem(&self) -> Option<Problem> {
         match self {
             Self::Invalid { problem, .. } => Some(*problem),

@@ -5,7 +5,7 @@ use crate::moments::Moments;
 
 /// Which rows satisfy |x_d - μ_d| <= z_th σ_d in every dimension d, with μ and σ (population) of `rows` themselves.
 ///
-/// Dimensions of zero spread say nothing and are skipped. A row with NaN or infinity is never kept.
+/// Dimensions of zero spread carry no information and are skipped. A row with NaN or infinity is never kept.
 pub fn zscore_keep(rows: &Rows<'_>, z_th: f64) -> Vec<bool> {
     let m = Moments::of(std::slice::from_ref(rows));
     let mut row = vec![0.0f32; rows.dim()];
@@ -19,8 +19,8 @@ pub fn zscore_keep(rows: &Rows<'_>, z_th: f64) -> Vec<bool> {
         .collect()
 }
 
-/// The largest |x_d - μ_d| / σ_d over the dimensions of every row, with μ and σ as in [`zscore_keep`]; infinite for a row with NaN or
-/// infinity.
+/// For every row, the largest |x_d - μ_d| / σ_d over the dimensions, with μ and σ as in [`zscore_keep`]; infinite for a
+/// row with NaN or infinity.
 pub fn largest_z(rows: &Rows<'_>) -> Vec<f64> {
     let m = Moments::of(std::slice::from_ref(rows));
     let mut row = vec![0.0f32; rows.dim()];

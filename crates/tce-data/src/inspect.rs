@@ -1,4 +1,4 @@
-//! What is in a data set, in numbers.
+//! Statistics of a data set.
 
 use serde::Serialize;
 
@@ -8,15 +8,15 @@ use crate::{Episode, ReferenceScores, Rows, Transitions};
 /// Mean, spread and range of one number per episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Summary {
-    /// How many numbers.
+    /// How many values there are.
     pub count: usize,
-    /// Their mean; 0 if there are none.
+    /// Mean; 0 if there are no values.
     pub mean: f64,
-    /// Their population standard deviation.
+    /// Population standard deviation.
     pub std: f64,
-    /// The smallest; 0 if there are none.
+    /// Smallest value; 0 if there are no values.
     pub min: f64,
-    /// The largest; 0 if there are none.
+    /// Largest value; 0 if there are no values.
     pub max: f64,
 }
 
@@ -36,7 +36,7 @@ impl Summary {
     }
 }
 
-/// The columns of one field, each list `[dim]`.
+/// Statistics of the columns of one field, each list `[dim]`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DimensionSummary {
     /// Mean of the finite values.
@@ -47,11 +47,11 @@ pub struct DimensionSummary {
     pub min: Vec<f32>,
     /// Largest finite value; 0 if there is none.
     pub max: Vec<f32>,
-    /// Dimensions that never change.
+    /// Constant dimensions.
     pub dead: Vec<usize>,
-    /// How many values are NaN.
+    /// Number of NaN values.
     pub nan: u64,
-    /// How many values are infinite.
+    /// Number of infinite values.
     pub infinite: u64,
 }
 
@@ -80,17 +80,17 @@ pub struct Inspection {
     pub obs_dim: usize,
     /// Action dimension.
     pub act_dim: usize,
-    /// Number of episodes, whole or cut.
+    /// Number of episodes, complete or cut.
     pub episodes: usize,
-    /// Episodes that ended by a terminal or reached the step limit.
+    /// Episodes that ended at a terminal or reached the step limit.
     pub complete_episodes: usize,
     /// Rows with a terminal.
     pub terminals: usize,
-    /// Rows with a time-out (or a cut).
+    /// Rows with a time-out (or where the episode was cut).
     pub timeouts: usize,
     /// Lengths of all episodes.
     pub lengths: Summary,
-    /// Undiscounted returns of the complete episodes; of all, if none is complete.
+    /// Undiscounted returns of the complete episodes; of all episodes if none is complete.
     pub returns: Summary,
     /// s.
     pub observations: DimensionSummary,
@@ -103,14 +103,15 @@ pub struct Inspection {
 }
 
 impl Inspection {
-    /// The mean return, normalised by `reference`; None if no episode is complete: a part of a return is no return.
+    /// The mean return, normalised by `reference`. `None` if no episode is complete: a partial return is not a return.
     pub fn normalised_score(&self, reference: Option<ReferenceScores>) -> Option<f64> {
         reference.filter(|_| self.complete_episodes > 0).map(|r| r.normalised_score(self.returns.mean))
     }
 }
 
-/// Measures `data`. An episode is complete if it ended by a terminal, or by a time-out: with a `step_limit`, if it is at most two rows
-/// short of it (the public files lost a row or two of their time-outs), otherwise if its end is marked.
+/// Computes the statistics of `data`. An episode is complete if it ended at a terminal or at a time-out. With a
+/// `step_limit`, a time-out counts if the episode is at most two rows short of it (the public files lost a row or two
+/// of their time-outs); without one, every marked end counts.
 pub fn inspect(data: &Transitions, step_limit: Option<usize>) -> Inspection {
     let episodes = data.episodes();
     let timed_out = |e: &&Episode| match step_limit {
@@ -159,7 +160,7 @@ mod tests {
         assert_eq!(got.observations.dead, [1]);
         assert_eq!((got.observations.mean[0], got.observations.std[0]), (3.0, 2.0));
         assert_eq!((got.next_observations.nan, got.next_observations.max[1]), (7, 0.0));
-        // Without a limit a marked time-out is an end like any other.
+        // Without a limit, every marked time-out is an end.
         assert_eq!(inspect(&t, None).complete_episodes, 2);
         t.timeouts[5] = false;
         assert_eq!(inspect(&t, None).complete_episodes, 1);

@@ -1,4 +1,4 @@
-//! Transitions: what they are, how they come from files and go back, how they are compared and selected.
+//! Transitions: their form, reading and writing of files, comparison and selection.
 //!
 //! | question | answer |
 //! |---|---|
@@ -15,7 +15,7 @@
 //! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
 //! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
 //!
-//! Everything here is deterministic: the same bytes at any number of threads.
+//! Everything here is deterministic: the results are the same bytes at any number of threads.
 
 mod actions;
 mod agents;

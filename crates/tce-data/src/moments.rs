@@ -1,10 +1,10 @@
-//! Mean, spread and range of every dimension, in f64, independent of the number of threads.
+//! Mean, spread and range of every dimension, computed in f64, independent of the number of threads.
 
 use rayon::prelude::*;
 
 use crate::Rows;
 
-/// Rows per partial sum. Part of the definition of the result: sums are added in chunk order.
+/// Rows per partial sum. It is part of the definition of the result: sums are added in chunk order.
 const CHUNK: usize = 4096;
 
 /// Moments per dimension, over all rows of one or more tables. NaN and infinity are counted and left out.
@@ -74,12 +74,12 @@ impl Partial {
 }
 
 impl Moments {
-    /// Over all rows of all `tables`, which have the same dimension. Two passes: the second measures the spread around
-    /// the first one's mean, so that a large offset costs no digits.
+    /// Computes the moments over all rows of all `tables`, which have the same dimension. There are two passes: the
+    /// second measures the spread around the mean of the first, so that a large offset costs no digits.
     pub fn of(tables: &[Rows<'_>]) -> Self {
         let dim = tables.first().map_or(0, Rows::dim);
         assert!(tables.iter().all(|t| t.dim() == dim), "the tables have different dimensions");
-        // Summing differences from an actual row makes the spread of a constant exactly zero.
+        // Sums of differences from an actual row make the spread of a constant exactly zero.
         let mut first = vec![0.0f32; dim];
         if let Some(table) = tables.iter().find(|t| !t.is_empty()) {
             table.copy_row(0, &mut first);

@@ -1,8 +1,8 @@
 //! Exact nearest-neighbour distances from many source rows to a few thousand target rows (Eq. 9).
 //!
-//! A blocked matrix product gives, for every pair, a *lower bound* of |x - y|² - |x|² that accounts for its own
-//! rounding; the few pairs whose lower bound is below the best upper bound are then measured exactly. So the result is
-//! that of comparing all pairs in f64, whatever the offset of the data, at the speed of the product.
+//! For every pair, a blocked matrix product gives a *lower bound* of |x - y|² - |x|² that accounts for its own
+//! rounding. The few pairs whose lower bound is below the best upper bound are then measured exactly. So the result
+//! equals that of comparing all pairs in f64, whatever the offset of the data, at the speed of the product.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -12,21 +12,21 @@ use crate::moments::Moments;
 use crate::product::Transposed;
 use crate::{DataError, Rows, Standardizer};
 
-/// Source rows and target rows per product; the tile (half a mebibyte) stays in the second-level cache.
+/// Source rows and target rows per product. The tile (half a mebibyte) fits into the second-level cache.
 const ROWS: usize = 256;
 const TILE: usize = 512;
-/// Above this squared norm, float32 products may overflow: such rows are compared exactly with everything.
+/// Above this squared norm, float32 products may overflow. Such rows are compared exactly with all others.
 const HUGE: f64 = 1e30;
 
-/// In which units distances are measured.
+/// The units of the distances.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Units {
-    /// As stored: Eq. 9 of the paper. Velocities dominate.
+    /// Stored units: Eq. 9 of the paper. Velocities dominate.
     #[default]
     Raw,
-    /// Every dimension divided by its std over source and target rows together (see [`Standardizer`]). The target
-    /// alone would make a joint that it blocks, and the source does not, the only one that counts.
+    /// Every dimension divided by its std over source and target rows together (see [`Standardizer`]). With the std of
+    /// the target alone, a joint that only the target blocks would dominate the distance.
     Standardised,
 }
 
@@ -35,7 +35,7 @@ pub enum Units {
 pub struct NeighbourOptions {
     /// Units of the distance.
     pub units: Units,
-    /// Distance to the k-th nearest target row; 1 is the nearest.
+    /// k: distances are measured to the k-th nearest target row; 1 is the nearest.
     pub k: usize,
 }
 
@@ -47,8 +47,8 @@ impl Default for NeighbourOptions {
 
 /// The L2 distance of every source row to its (k-th) nearest target row, `[source.len()]`.
 ///
-/// Exact: differences and sums in f64, rounded to f32 once. Independent of the number of threads. Memory beside the
-/// result: the target rows once more, and a megabyte per thread.
+/// Exact: differences and sums in f64, rounded to f32 once. Independent of the number of threads. Memory in addition to
+/// the result: one copy of the target rows, and a megabyte per thread.
 ///
 /// # Errors
 /// [`DataError::Interrupted`].
@@ -77,7 +77,7 @@ pub fn nn_distances(source: &Rows<'_>, target: &Rows<'_>, options: &NeighbourOpt
     Ok(out)
 }
 
-/// The source rows of Eq. 9: the `round(lambda * N)` smallest distances, ties broken by row, in row order.
+/// The source rows selected by Eq. 9: the `round(lambda * N)` smallest distances, ties broken by row, in row order.
 ///
 /// # Panics
 /// If `lambda` is not in [0, 1].
@@ -94,13 +94,13 @@ pub fn lambda_quantile_select(distances: &[f32], lambda: f64) -> Vec<usize> {
 }
 
 struct Search {
-    /// Dimensions that vary at all; the others add nothing to any distance.
+    /// Dimensions that vary; the others contribute nothing to any distance.
     live: Vec<usize>,
     centre: Vec<f64>,
     scale: Vec<f64>,
     /// Target rows, live dimensions, as stored: `[len, live]`.
     exact: Vec<f32>,
-    /// Target rows centred and scaled, with |y|² as the last coordinate.
+    /// Target rows, centred and scaled, with |y|² as the last coordinate.
     tiles: Transposed,
     norms: Vec<f64>,
     /// Relative rounding error of a lower bound.
@@ -118,7 +118,7 @@ struct Scratch {
     best: Vec<Best>,
 }
 
-/// What is known about one source row.
+/// What is known about one source row during the search.
 #[derive(Default, Clone)]
 struct Best {
     /// |x|² of the centred and scaled row.
@@ -157,7 +157,7 @@ impl Search {
             target.copy_row(j, &mut raw);
             search.exact.extend(search.live.iter().map(|&d| raw[d]));
             let norm = search.prepare(&raw, point);
-            // -2xy + |y|² comes out of the product with x extended by 1, less the rounding error that may be in it.
+            // The product with x extended by 1 gives -2xy + |y|², minus its largest possible rounding error.
             point[width - 1] = (-0.5 * norm * (1.0 - 2.0 * search.slack)) as f32;
             search.norms.push(norm);
             search.any_huge |= norm > HUGE;
@@ -210,13 +210,13 @@ impl Search {
         }
     }
 
-    /// Keeps the rows of a tile that may be near, and tightens the upper bound.
+    /// Keeps the rows of a tile that may be among the nearest, and tightens the upper bound.
     fn offer(&self, best: &mut Best, tile: usize, lower: &[f32]) {
         for (j, &low) in lower.iter().enumerate() {
             if low <= best.upper[self.k - 1] {
                 best.candidates.push(((tile + j) as u32, low));
-                // `low` lacks |x|² and its share of the rounding error, both common to the row: they count here instead.
-                // The last term covers products that underflow.
+                // `low` lacks |x|² and its share of the rounding error. Both are the same for the whole row and are
+                // added here. The last term covers products that underflow.
                 let error = 4.0 * self.slack * (best.norm + self.norms[tile + j]) + 1e-30;
                 let high = ((low as f64 + error) as f32).next_up();
                 let at = best.upper.partition_point(|&u| u <= high);
@@ -245,7 +245,7 @@ impl Search {
     }
 }
 
-/// The smallest of `values`, in a form the compiler turns into wide minima.
+/// The smallest of `values`, written so that the compiler uses SIMD minima.
 fn minimum(values: &[f32]) -> f32 {
     let mut lanes = [f32::INFINITY; 16];
     let chunks = values.chunks_exact(16);
@@ -265,7 +265,7 @@ mod tests {
     use rand::RngExt;
     use tce_base::Streams;
 
-    /// All pairs, in f64, from the definition.
+    /// Compares all pairs in f64, from the definition.
     fn brute(source: &[f32], target: &[f32], dim: usize, k: usize, scale: &[f64]) -> Vec<f32> {
         let row = |x: &[f32]| {
             let mut all: Vec<f64> = target
@@ -282,7 +282,7 @@ mod tests {
         nn_distances(&Rows::new(source, dim), &Rows::new(target, dim), &options).unwrap()
     }
 
-    /// Different summation orders of the same f64 terms may differ in the last bit of the f32.
+    /// Different summation orders of the same f64 terms may change the last bit of the f32.
     fn same(a: &[f32], b: &[f32]) -> bool {
         a.len() == b.len() && a.iter().zip(b).all(|(x, y)| (x - y).abs() <= 2e-7 * y.abs())
     }

@@ -1,8 +1,8 @@
-//! The one matrix product that neighbours and transport share.
+//! The matrix product that neighbours and transport share.
 
 use gemm::Parallelism;
 
-/// Points stored coordinate by coordinate (`[dim, len]`), the order the product reads them in.
+/// Points stored coordinate by coordinate (`[dim, len]`), the order in which the product reads them.
 pub(crate) struct Transposed {
     pub data: Vec<f32>,
     pub len: usize,
@@ -10,7 +10,7 @@ pub(crate) struct Transposed {
 }
 
 impl Transposed {
-    /// From row-major `[len, dim]`.
+    /// Transposes row-major `[len, dim]`.
     pub fn from_rows(rows: &[f32], dim: usize) -> Self {
         let len = rows.len() / dim;
         let mut data = vec![0.0; rows.len()];
@@ -23,7 +23,7 @@ impl Transposed {
     }
 
     /// `out[i * count + j] = alpha * <x_i, y_{first + j}>` for the row-major points `x` (`[rows, dim]`) and `count` of
-    /// the own points from `first` on. On the calling thread only: callers split the rows.
+    /// the points of `self` from `first` on. Runs on the calling thread only: callers split the rows.
     pub fn dot(&self, x: &[f32], first: usize, count: usize, alpha: f32, out: &mut [f32]) {
         let rows = x.len() / self.dim;
         assert!(x.len() == rows * self.dim && first + count <= self.len && out.len() >= rows * count);

@@ -1,4 +1,4 @@
-//! How good the policy was that collected a data set.
+//! Quality of the policy that collected a data set.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,21 +10,21 @@ use tce_base::did_you_mean;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Quality {
-    /// A policy stopped at about a third of the expert's return. "m" in the paper's tables.
+    /// A policy whose training stopped at about a third of the expert's return. "m" in the paper's tables.
     Medium,
-    /// The replay buffer up to that policy (source data only). "m-r".
+    /// The replay buffer of training up to the medium policy (source data only). "m-r".
     MediumReplay,
-    /// Medium and expert, one after the other. "m-e".
+    /// Medium and expert data, concatenated. "m-e".
     MediumExpert,
     /// The fully trained policy. "e".
     Expert,
 }
 
 impl Quality {
-    /// All qualities, from the paper's source columns to its target columns.
+    /// All qualities, in the order of the paper's source columns, then its target columns.
     pub const ALL: [Quality; 4] = [Quality::Medium, Quality::MediumReplay, Quality::MediumExpert, Quality::Expert];
 
-    /// The name as in task names: `medium-replay`.
+    /// The name used in task names: `medium-replay`.
     pub fn name(self) -> &'static str {
         match self {
             Quality::Medium => "medium",
@@ -44,7 +44,7 @@ impl fmt::Display for Quality {
 impl FromStr for Quality {
     type Err = String;
 
-    /// Reads `medium-replay`, `medium_replay` (file names) and the paper's `m-r`.
+    /// Parses `medium-replay`, `medium_replay` (file names) and the paper's `m-r`.
     fn from_str(text: &str) -> Result<Self, String> {
         match text.replace('_', "-").as_str() {
             "medium" | "m" => Ok(Quality::Medium),

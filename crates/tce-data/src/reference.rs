@@ -1,4 +1,4 @@
-//! The shifts of the benchmark, and the returns that stand for 0 and 100.
+//! The shifts of the benchmark, and the reference returns with scores 0 and 100.
 
 use std::fmt;
 use std::str::FromStr;
@@ -8,13 +8,13 @@ use tce_base::did_you_mean;
 
 use crate::Agent;
 
-/// What distinguishes the target domain from the source domain.
+/// The difference between the target domain and the source domain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Shift {
     /// The unchanged robot (gym's v2 models).
     #[serde(rename = "source")]
     Source,
-    /// Limbs of other lengths or radii.
+    /// Limbs of different lengths or radii.
     #[serde(rename = "morph")]
     Morph,
     /// A joint that can hardly move.
@@ -32,7 +32,7 @@ impl Shift {
     /// All shifts.
     pub const ALL: [Shift; 5] = [Shift::Source, Shift::Morph, Shift::Kinematic, Shift::Gravity, Shift::Gravity5];
 
-    /// The name as in task names.
+    /// The name used in task names.
     pub fn name(self) -> &'static str {
         match self {
             Shift::Source => "source",
@@ -43,7 +43,7 @@ impl Shift {
         }
     }
 
-    /// The name as in OTDF's and ODRL's file names (`ant_gravity_0.5_medium.hdf5`).
+    /// The name used in OTDF's and ODRL's file names (`ant_gravity_0.5_medium.hdf5`).
     pub fn file_name(self) -> &'static str {
         match self {
             Shift::Gravity => "gravity_0.5",
@@ -62,7 +62,7 @@ impl fmt::Display for Shift {
 impl FromStr for Shift {
     type Err = String;
 
-    /// Reads [`Shift::name`] and [`Shift::file_name`].
+    /// Parses [`Shift::name`] and [`Shift::file_name`].
     fn from_str(text: &str) -> Result<Self, String> {
         Shift::ALL.into_iter().find(|s| s.name() == text || s.file_name() == text).ok_or_else(|| {
             let hint = did_you_mean(text, Shift::ALL.map(Shift::name));
@@ -85,9 +85,9 @@ pub enum ScoreTable {
 /// The returns of a random and of an expert policy.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceScores {
-    /// J_r: scores 0.
+    /// J_r: the return with score 0.
     pub min: f64,
-    /// J_e: scores 100.
+    /// J_e: the return with score 100.
     pub max: f64,
 }
 
@@ -98,8 +98,9 @@ impl ReferenceScores {
     }
 }
 
-/// The reference returns of `agent` under `shift`: D4RL's for the source domain (in either table), `table`'s for the
-/// three shifts, ODRL's for Ant under five times the gravity. Nobody publishes the other three agents' there: `None`.
+/// The reference returns of `agent` under `shift`: D4RL's for the source domain (in either table), those of `table` for
+/// the three shifts, ODRL's for Ant under five times the gravity. `None` for the other three agents: none are
+/// published.
 pub fn reference_scores(agent: Agent, shift: Shift, table: ScoreTable) -> Option<ReferenceScores> {
     use Agent::*;
     use Shift::*;

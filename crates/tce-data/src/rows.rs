@@ -1,4 +1,4 @@
-//! Rows as points: several columns side by side, without copying them together.
+//! Views rows as points: several columns side by side, without copying them into one matrix.
 
 use std::ops::Range;
 
@@ -21,7 +21,7 @@ impl<'a> Rows<'a> {
     /// Row i is the concatenation of row i of every `(matrix, columns)`.
     ///
     /// # Panics
-    /// If a part has no columns, is not rectangular, or has another number of rows than the first.
+    /// If a part has no columns, is not rectangular, or has a different number of rows than the first part.
     pub fn join(parts: &[(&'a [f32], usize)]) -> Self {
         let rows = |&(data, dim): &(&[f32], usize)| {
             assert!(dim > 0 && data.len() % dim == 0, "{} numbers do not make rows of {dim}", data.len());
@@ -73,7 +73,7 @@ impl<'a> Rows<'a> {
         }
     }
 
-    /// All rows, copied together: `[len, dim]`.
+    /// Copies all rows into one vector: `[len, dim]`.
     pub fn to_vec(&self) -> Vec<f32> {
         let mut out = vec![0.0; self.len * self.dim];
         self.copy_rows(0..self.len, &mut out);

@@ -1,18 +1,18 @@
-//! Zero mean and unit spread per dimension, without blowing up dimensions that hardly move.
+//! Standardises every dimension to zero mean and unit spread, without amplifying dimensions that hardly move.
 
 use serde::{Deserialize, Serialize};
 
 use crate::moments::Moments;
 use crate::{Rows, Transitions};
 
-/// The smallest std that a live dimension is divided by, relative to the median std of the live dimensions.
+/// The smallest divisor of a live dimension, relative to the median std of the live dimensions.
 ///
-/// A blocked joint moves by about .003 rad (Hopper kinematic) while its own velocity and the other joints move by
-/// .1 to 10: dividing by the tiny std is right for the simulator, which needs that angle as much as any other, but a
-/// source state outside of the blocked range would become an input of a hundred sigmas. One thousandth of the median
-/// lies a factor of ten below every live dimension of the public benchmark files (their smallest are 11 thousandths in s
-/// and 14 thousandths in s' - s, both Hopper kinematic expert's thigh), so nothing real is attenuated there, and above
-/// what float32 rounding of a resting joint produces. Quieter signals can have a smaller floor through
+/// A blocked joint moves by about .003 rad (Hopper kinematic), while its own velocity and the other joints move by .1
+/// to 10. Division by the tiny std is right for the simulator, which needs that angle as much as any other. But a
+/// source state outside the blocked range would become an input of a hundred sigmas. One thousandth of the median is a
+/// factor of ten below every live dimension of the public benchmark files (their smallest are 11 thousandths in s and
+/// 14 thousandths in s' - s, both Hopper kinematic expert's thigh), so no real signal is attenuated there. It is above
+/// the float32 rounding of a resting joint. For weaker signals, choose a smaller floor with
 /// [`Standardizer::fit_with_floor`].
 pub const RELATIVE_FLOOR: f64 = 1e-3;
 
@@ -20,11 +20,11 @@ pub const RELATIVE_FLOOR: f64 = 1e-3;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Standardizer {
-    /// Mean per dimension; of a dead dimension, its one value.
+    /// Mean per dimension; for a dead dimension, its constant value.
     pub mean: Vec<f32>,
     /// Divisor per dimension, always positive: the std, at least the floor; 1 for a dead dimension.
     pub std: Vec<f32>,
-    /// Dimensions without any spread (Ant's 84 contact slots), ascending.
+    /// Constant dimensions (Ant's 84 contact slots), ascending.
     pub dead: Vec<usize>,
     /// Live dimensions whose std was below the floor, ascending.
     pub floored: Vec<usize>,
@@ -47,7 +47,7 @@ impl Standardizer {
         Self::fit_with_floor(tables, RELATIVE_FLOOR)
     }
 
-    /// As [`Standardizer::fit_on`], with another floor (relative to the median std of the live dimensions).
+    /// Like [`Standardizer::fit_on`], with another floor (relative to the median std of the live dimensions).
     pub fn fit_with_floor(tables: &[Rows<'_>], relative_floor: f64) -> Self {
         let m = Moments::of(tables);
         let dim = m.mean.len();
@@ -71,7 +71,7 @@ impl Standardizer {
         out
     }
 
-    /// The map that changes nothing.
+    /// The identity map.
     pub fn identity(dim: usize) -> Self {
         Self { mean: vec![0.0; dim], std: vec![1.0; dim], dead: Vec::new(), floored: Vec::new() }
     }
@@ -93,7 +93,7 @@ impl Standardizer {
         out
     }
 
-    /// Standardises row-major `data` where it stands.
+    /// Standardises row-major `data` in place.
     ///
     /// # Panics
     /// If `data` is not rectangular.
@@ -102,7 +102,7 @@ impl Standardizer {
         data.chunks_exact_mut(self.dim().max(1)).for_each(|row| self.apply_row(row));
     }
 
-    /// Standardises one row where it stands.
+    /// Standardises one row in place.
     pub fn apply_row(&self, row: &mut [f32]) {
         for ((x, m), s) in row.iter_mut().zip(&self.mean).zip(&self.std) {
             *x = (*x - m) / s;
@@ -129,8 +129,8 @@ impl Standardizer {
         }
     }
 
-    /// Sets the dead dimensions of row-major `data` (in original units) to the one value they have: what a generative
-    /// model leaves there is noise.
+    /// Sets the dead dimensions of row-major `data` (in original units) to their constant value. A generative model
+    /// leaves noise there.
     pub fn restore_dead(&self, data: &mut [f32]) {
         for row in data.chunks_exact_mut(self.dim().max(1)) {
             self.dead.iter().for_each(|&d| row[d] = self.mean[d]);
@@ -138,8 +138,8 @@ impl Standardizer {
     }
 }
 
-/// The map under which states of a half-and-half batch have zero mean and unit variance: target and other rows count the
-/// same, however many more of the others there are.
+/// The map for which the states of a half-and-half batch have zero mean and unit variance. Target rows and other rows
+/// have equal weight, however many more of the others there are.
 pub fn even_standardizer(target: &Transitions, other: Option<&Transitions>) -> Standardizer {
     let d = target.obs_dim;
     let mut few = Vec::new();

@@ -1,7 +1,7 @@
-//! What the columns of observations respect, and making generated rows respect it too.
+//! Finds constraints that the columns of observations satisfy, and applies them to generated rows.
 //!
-//! A generative model with smooth outputs leaves values where no sensor ever puts one. [`Support::fit`] finds four kinds
-//! of columns; each column is of one kind at most, the first that fits:
+//! A generative model with smooth outputs produces values that a sensor never produces. [`Support::fit`] finds four
+//! kinds of columns. Each column has at most one kind, the first that fits:
 //!
 //! | kind | found if | [`Support::apply`] |
 //! |---|---|---|
@@ -10,35 +10,35 @@
 //! | unit vector: 4 neighbouring columns (a quaternion) or 2 (cosine and sine) | norm 1 within .001 in 99 % of every table's rows, and far steadier than the columns themselves | divides by the norm |
 //! | clipped | an atom at the minimum or the maximum, see [`Clip`] | clamps at that end |
 //!
-//! All other columns keep their bytes. Fewer than 100 rows say nothing.
+//! All other columns keep their bytes. Nothing is concluded from fewer than 100 rows.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// The fewest rows from which anything is concluded.
 const LEAST_ROWS: usize = 100;
-/// The fewest rows in which few distinct values mean something, and how many values are few.
+/// The fewest rows for which a small number of distinct values is meaningful, and the largest such number.
 const LEVEL_ROWS: usize = 1000;
 const MOST_LEVELS: usize = 8;
-/// An atom: this many rows, and this share of the rows of a table, at exactly the extreme value.
+/// An atom: at least this many rows, and this share of the rows of a table, have exactly the extreme value.
 const ATOM_ROWS: usize = 5;
 const ATOM_SHARE: f64 = 0.002;
-/// Ordinary values occur at most twice (a table may hold s and s'); this share of the distinct ones has to.
+/// Ordinary values occur at most twice (a table may hold s and s'). This share of the distinct values must be ordinary.
 const ORDINARY_COUNT: usize = 2;
 const ORDINARY_SHARE: f64 = 0.75;
-/// A norm is 1 within this in this share of the rows.
+/// A norm must be 1 within this tolerance in this share of the rows.
 const NORM_TOLERANCE: f64 = 1e-3;
 const NORM_SHARE: f64 = 0.99;
-/// The squared norm's deviation from 1 (root mean square), relative to what independent columns of the same spread had.
+/// Largest deviation of the squared norm from 1 (root mean square), relative to independent columns of the same spread.
 const NORM_STEADINESS: f64 = 0.05;
-/// What float32 leaves of a normalised vector: within this nothing is done, so that doing it twice changes nothing.
+/// Rounding error of a normalised float32 vector. Within it nothing is changed: a second application has no effect.
 const NORM_ROUNDING: f64 = 4e-7;
 
-/// A column without any spread.
+/// A constant column.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Constant {
-    /// Which column, from 0.
+    /// Column index, from 0.
     pub column: usize,
     /// Its value.
     pub value: f32,
@@ -48,32 +48,32 @@ pub struct Constant {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Levels {
-    /// Which column, from 0.
+    /// Column index, from 0.
     pub column: usize,
-    /// The values that occur, ascending; 2 to 8.
+    /// The distinct values, ascending; 2 to 8.
     pub values: Vec<f32>,
 }
 
-/// An end at which a column is clipped.
+/// A bound at which a column is clipped.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Bound {
     /// The extreme value, in the column's units.
     pub value: f32,
-    /// How many rows of all tables have exactly this value.
+    /// Number of rows of all tables that have exactly this value.
     pub rows: usize,
 }
 
 /// A clipped column.
 ///
-/// An end is clipped if at least 5 rows and .2 % of the rows of one table have exactly the extreme value of all tables, while
-/// three quarters of that table's other distinct values occur at most twice. An end is also clipped if its extreme value is
-/// exactly plus or minus the bound of a column that was found so: one sensor clips all its columns at the same bound, and
-/// a continuous column practically never ends exactly there. (0 is no such bound.)
+/// An end is clipped if at least 5 rows and .2 % of the rows of one table have exactly the extreme value of all tables,
+/// while three quarters of that table's other distinct values occur at most twice. An end is also clipped if its
+/// extreme value is exactly plus or minus a bound found in this way in another column: one sensor clips all its columns
+/// at the same bound, and a continuous column practically never ends exactly there. (0 does not count as such a bound.)
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Clip {
-    /// Which column, from 0.
+    /// Column index, from 0.
     pub column: usize,
     /// The lower bound, if the column is clipped there.
     pub low: Option<Bound>,
@@ -81,37 +81,37 @@ pub struct Clip {
     pub high: Option<Bound>,
 }
 
-/// Neighbouring columns that are a unit vector.
+/// Neighbouring columns that form a unit vector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct UnitGroup {
-    /// The first column, from 0.
+    /// Index of the first column, from 0.
     pub first: usize,
-    /// How many columns: 4 (a quaternion) or 2 (cosine and sine).
+    /// Number of columns: 4 (a quaternion) or 2 (cosine and sine).
     pub width: usize,
 }
 
-/// What the columns of some tables respect.
+/// The constraints that the columns of some tables satisfy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Support {
     /// Number of columns.
     pub dim: usize,
-    /// How many rows all tables had together.
+    /// Number of rows of all tables together.
     pub rows: usize,
-    /// Columns without any spread, ascending.
+    /// Constant columns, ascending.
     pub constants: Vec<Constant>,
     /// Columns with few distinct values, ascending.
     pub levels: Vec<Levels>,
-    /// Unit vectors, ascending, without overlaps.
+    /// Unit vectors, ascending, not overlapping.
     pub units: Vec<UnitGroup>,
     /// Clipped columns, ascending.
     pub clips: Vec<Clip>,
 }
 
 impl Support {
-    /// Looks at row-major `tables` of `dim` columns each (s and s' are tables of their own). What is found holds in all
-    /// tables together; an atom in one table is enough, so that a large source does not hide a small target.
+    /// Finds the constraints of row-major `tables` with `dim` columns each (s and s' are separate tables). A constraint
+    /// must hold in all tables together. An atom in one table is enough: a large source must not hide a small target.
     ///
     /// Columns with NaN or infinity are left alone.
     ///
@@ -143,8 +143,8 @@ impl Support {
         out
     }
 
-    /// Makes row-major `rows` respect it, where they stand. Doing it twice changes nothing more; NaN stays NaN (outside of
-    /// constant columns), a vector without length stays as it is.
+    /// Changes row-major `rows` in place so that they satisfy the constraints. A second application changes nothing.
+    /// NaN stays NaN (except in constant columns); a vector of length zero is not changed.
     ///
     /// # Panics
     /// If `rows` is not rectangular.
@@ -152,7 +152,7 @@ impl Support {
         assert_eq!(rows.len() % self.dim.max(1), 0, "not rows of {}", self.dim);
         for row in rows.chunks_exact_mut(self.dim.max(1)) {
             for c in &self.constants {
-                // -0 and 0 are the same value: bytes of right values stay.
+                // -0 and 0 are the same value: if the value is right, its bytes are kept.
                 if row[c.column] != c.value {
                     row[c.column] = c.value;
                 }
@@ -174,12 +174,12 @@ impl Support {
         }
     }
 
-    /// Whether nothing was found: [`Support::apply`] changes nothing.
+    /// Whether no constraint was found, so that [`Support::apply`] changes nothing.
     pub fn is_empty(&self) -> bool {
         self.constants.is_empty() && self.levels.is_empty() && self.units.is_empty() && self.clips.is_empty()
     }
 
-    /// One sentence for every finding. Neighbouring columns with the same constant are one finding. Columns count from 0.
+    /// One sentence for every finding. Neighbouring columns with the same constant share one. Columns count from 0.
     pub fn describe(&self) -> Vec<String> {
         let mut out = Vec::new();
         let same = |a: &Constant, b: &Constant| a.column + 1 == b.column && a.value == b.value;
@@ -220,17 +220,17 @@ impl Support {
     }
 }
 
-/// What one pass over a column tells.
+/// The result of one pass over a column.
 struct Column {
     finite: bool,
     min: f32,
     max: f32,
-    /// The distinct values, ascending, as long as there are at most [`MOST_LEVELS`]; otherwise one more.
+    /// The distinct values, ascending, if there are at most [`MOST_LEVELS`]; otherwise one more than that.
     levels: Vec<f32>,
 }
 
 impl Column {
-    /// All columns in one pass over the rows: a million rows of 111 columns do not fit a cache.
+    /// Scans all columns in one pass over the rows: a million rows of 111 columns do not fit into a cache.
     fn scan(tables: &[&[f32]], dim: usize) -> Vec<Column> {
         let new = || Column { finite: true, min: f32::INFINITY, max: f32::NEG_INFINITY, levels: Vec::new() };
         let mut columns: Vec<Column> = (0..dim).map(|_| new()).collect();
@@ -252,7 +252,7 @@ fn values(table: &[f32], dim: usize, column: usize) -> impl Iterator<Item = &f32
     table.iter().skip(column).step_by(dim)
 }
 
-/// The nearest of `values` (ascending); the smaller one of two that are equally near. NaN stays.
+/// The nearest of `values` (ascending); the smaller one of two equally near values. NaN stays NaN.
 fn nearest(values: &[f32], x: f32) -> f32 {
     if x.is_nan() || values.contains(&x) {
         return x;
@@ -273,7 +273,7 @@ fn squared_norm(vector: &[f32]) -> f64 {
     vector.iter().map(|&x| (x as f64).powi(2)).sum()
 }
 
-/// All windows of `free` columns that are unit vectors; of overlapping ones those whose norm is steadiest.
+/// All windows of `free` columns that are unit vectors. Of overlapping windows, those with the steadiest norm are kept.
 fn unit_groups(tables: &[&[f32]], dim: usize, free: &[bool]) -> Vec<UnitGroup> {
     let windows: Vec<UnitGroup> = [4, 2]
         .into_iter()
@@ -293,7 +293,7 @@ fn unit_groups(tables: &[&[f32]], dim: usize, free: &[bool]) -> Vec<UnitGroup> {
     out
 }
 
-/// Root mean square of the squared norm's deviation from 1, if the columns are a unit vector.
+/// Root mean square of the squared norm's deviation from 1; `None` if the columns are not a unit vector.
 fn deviation(tables: &[&[f32]], dim: usize, group: UnitGroup) -> Option<f64> {
     let (mut within, mut squares) = (0usize, 0.0f64);
     let mut sums = [(0.0f64, 0.0f64); 4];
@@ -328,7 +328,7 @@ fn deviation(tables: &[&[f32]], dim: usize, group: UnitGroup) -> Option<f64> {
 /// Clipped columns among the `free` ones.
 fn clips(tables: &[&[f32]], dim: usize, columns: &[Column], free: &[bool]) -> Vec<Clip> {
     let candidates: Vec<usize> = (0..dim).filter(|&d| free[d]).collect();
-    // Per candidate and end: rows at the extreme, and whether they are an atom.
+    // For each candidate and end: the number of rows at the extreme value, and whether they are an atom.
     let ends: Vec<[(Bound, bool); 2]> = candidates
         .par_iter()
         .map(|&d| [columns[d].min, columns[d].max].map(|extreme| atom(tables, dim, d, extreme)))
@@ -344,7 +344,7 @@ fn clips(tables: &[&[f32]], dim: usize, columns: &[Column], free: &[bool]) -> Ve
         .collect()
 }
 
-/// How many rows have exactly the `extreme` value, and whether that is an atom in one of the tables.
+/// Number of rows that have exactly the `extreme` value, and whether they are an atom in one of the tables.
 fn atom(tables: &[&[f32]], dim: usize, column: usize, extreme: f32) -> (Bound, bool) {
     let mut bound = Bound { value: extreme, rows: 0 };
     let mut is_atom = false;
@@ -360,7 +360,7 @@ fn atom(tables: &[&[f32]], dim: usize, column: usize, extreme: f32) -> (Bound, b
     (bound, is_atom)
 }
 
-/// Whether most distinct values of a column besides `extreme` are ordinary ones.
+/// Whether most distinct values of a column other than `extreme` are ordinary ones.
 fn mostly_distinct(table: &[f32], dim: usize, column: usize, extreme: f32) -> bool {
     let mut others: Vec<f32> = values(table, dim, column).copied().filter(|x| *x != extreme).collect();
     others.par_sort_unstable_by(f32::total_cmp);

@@ -1,4 +1,4 @@
-//! The benchmark's tasks: `halfcheetah-morph/medium/expert`.
+//! The tasks of the benchmark, for example `halfcheetah-morph/medium/expert`.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -9,13 +9,13 @@ use tce_base::did_you_mean;
 
 use crate::{Agent, Quality, Shift};
 
-/// One transfer problem: an agent, how the target differs from the source, and the quality of both data sets.
+/// One transfer problem: an agent, the difference between target and source, and the quality of both data sets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Task {
     /// The robot.
     pub agent: Agent,
-    /// What the target domain changes.
+    /// The change in the target domain.
     pub shift: Shift,
     /// Quality of the source data.
     pub source: Quality,
@@ -39,12 +39,12 @@ impl Task {
         tasks
     }
 
-    /// The name as a directory: `halfcheetah-morph-medium-expert` would be ambiguous, so the arrow stays as `-to-`.
+    /// The name as a directory. The arrow becomes `-to-`, because `halfcheetah-morph-medium-expert` would be ambiguous.
     pub fn directory(&self) -> String {
         format!("{}-{}_{}-to-{}", self.agent, self.shift, self.source, self.target)
     }
 
-    /// OTDF's file with this task's target data under `shared` (`$TCE_SHARED`).
+    /// Path under `shared` (`$TCE_SHARED`) of OTDF's file with this task's target data.
     pub fn target_file(&self, shared: &Path) -> PathBuf {
         let quality = self.target.name().replace('-', "_");
         shared.join(format!("datasets/otdf/{}_{}_{quality}.hdf5", self.agent, self.shift.file_name()))
@@ -58,8 +58,8 @@ impl fmt::Display for Task {
 }
 
 impl Task {
-    /// `halfcheetah-morph:medium->expert`: the first form of the name. Files keep it, so that those of all versions are the same; as a
-    /// word of a command the shell would take the `>` for itself.
+    /// `halfcheetah-morph:medium->expert`: the older form of the name. Files keep it, so that files of all versions are
+    /// the same. In a command, the shell would interpret the `>`.
     pub fn with_arrow(&self) -> String {
         format!("{}-{}:{}->{}", self.agent, self.shift, self.source, self.target)
     }
@@ -79,7 +79,7 @@ impl TryFrom<String> for Task {
     }
 }
 
-/// An agent's name, for clap and for tasks.
+/// Parses an agent's name, for clap and for tasks.
 pub fn parse_agent(text: &str) -> Result<Agent, String> {
     Agent::ALL.into_iter().find(|a| a.name() == text).ok_or_else(|| {
         let hint = did_you_mean(text, Agent::ALL.map(Agent::name));
@@ -87,7 +87,7 @@ pub fn parse_agent(text: &str) -> Result<Agent, String> {
     })
 }
 
-/// `hopper-morph`, or `hopper` for the source domain.
+/// Parses `hopper-morph`, or `hopper` for the source domain.
 pub fn parse_environment(text: &str) -> Result<(Agent, Shift), String> {
     match text.split_once(['-', '_']) {
         None => Ok((parse_agent(text)?, Shift::Source)),
@@ -95,17 +95,17 @@ pub fn parse_environment(text: &str) -> Result<(Agent, Shift), String> {
     }
 }
 
-/// Robot with shift, source and target of `ROBOT-SHIFT/SOURCE/TARGET` or `ROBOT-SHIFT:SOURCE->TARGET`.
+/// Splits `ROBOT-SHIFT/SOURCE/TARGET` or `ROBOT-SHIFT:SOURCE->TARGET` into robot with shift, source and target.
 fn parts(text: &str) -> Option<[&str; 3]> {
     let (environment, data) = text.split_once(['/', ':'])?;
     let (source, target) = data.split_once("->").or_else(|| data.split_once('/'))?;
     Some([environment, source, target].map(str::trim))
 }
 
-/// What to say of a text without the form of a task.
+/// The error message for a text that is not a task name.
 fn no_task(text: &str) -> String {
     let expected = "expected ROBOT-SHIFT/SOURCE/TARGET, as in hopper-morph/medium/expert";
-    // What is left of `hopper-morph:medium->expert` without quotes.
+    // The shell leaves this of `hopper-morph:medium->expert` without quotes.
     if let Some(source) = text.strip_suffix('-').filter(|t| t.contains(':')) {
         return format!(
             "`{text}` is no task: the shell took the `>` and what follows for a file's name (such a file may be here now); \
@@ -114,7 +114,7 @@ fn no_task(text: &str) -> String {
         );
     }
     let all: Vec<String> = Task::all().iter().map(Task::to_string).collect();
-    // `hopper-morph:medium-expert` means medium and expert, not a target that is missing.
+    // `hopper-morph:medium-expert` means medium and expert; the target is not missing.
     let mut guess = text.replacen(':', "/", 1);
     if guess.matches('/').count() == 1
         && let Some((environment, data)) = guess.split_once('/')
@@ -129,7 +129,7 @@ fn no_task(text: &str) -> String {
 impl FromStr for Task {
     type Err = String;
 
-    /// Reads both forms of the name, and the paper's short ones (`ant-gravity_0.5:m-r->m-e`).
+    /// Parses both forms of the name, and the paper's short ones (`ant-gravity_0.5:m-r->m-e`).
     fn from_str(text: &str) -> Result<Self, String> {
         let [environment, source, target] = parts(text).ok_or_else(|| no_task(text))?;
         let of = |e: String| format!("`{text}` is no task: {e}");

@@ -1,7 +1,7 @@
-//! Which trajectories of a data set of mixed quality to learn from.
+//! Chooses the trajectories to learn from in a data set of mixed quality.
 //!
-//! Cloning a set of two qualities clones neither; a set of one quality needs all its rows. [`choose_trajectories`] decides
-//! from the rewards alone.
+//! A policy cloned from data of two qualities matches neither; a data set of one quality needs all its rows.
+//! [`choose_trajectories`] decides from the rewards alone.
 //!
 //! # The measures
 //!
@@ -10,45 +10,47 @@
 //! | return | whole trajectories: they end by a terminal, or are at most two rows short of the longest | the sum of the rewards |
 //! | pace | trajectories at least a quarter as long as the longest | the median, over windows of a tenth of the longest trajectory, of the mean reward per step |
 //!
-//! The pace hardly sees the start, a fall or an accident, nor where the log was cut; the return sees that a robot falls.
-//! A group's spread is the range of its values, without the outer tenth at either end where it has ten or more.
+//! The pace hardly depends on the start, a fall, an accident or the place where the log was cut. The return shows
+//! whether a robot falls. A group's spread is the range of its values; with ten or more values, without the outer tenth
+//! at either end.
 //!
 //! # The rule
 //!
-//! The trajectories are split in two groups of least variance (weighed by rows): the whole ones by pace, then by return, then all by
-//! pace; the first clear split counts. With `g` = the gap between the groups, divided by the spread plus a hundredth of
-//! the better group's mean, and c the setting ([`CLEAR_GAP`]), a split is clear if the better group's mean return is higher
-//! by 15 % and one of these holds:
+//! The trajectories are split into two groups of least variance (weighted by rows): the whole ones by pace, then by
+//! return, then all by pace; the first clear split is used. Let `g` be the gap between the groups, divided by the
+//! spread plus a hundredth of the better group's mean, and c the setting ([`CLEAR_GAP`]). A split is clear if the
+//! better group's mean return is higher by 15 % and one of these holds:
 //!
 //! - by pace: g_pace ≥ c, and the mean paces differ by 15 % (and, if the better group has one whole trajectory only,
 //!   g_return ≥ .6 c);
 //! - by both: g_return ≥ .6 c and g_pace ≥ .6 c, and the mean paces differ by 5 %;
-//! - by return (robots that are paid for not falling): g_return ≥ 1.5 c, and there are two or more whole trajectories in the
-//!   worse group. A single short one is an accident, not a behaviour.
+//! - by return (robots that are rewarded for not falling): g_return ≥ 1.5 c, and the worse group has two or more whole
+//!   trajectories. A single short one is an accident, not a behaviour.
 //!
-//! The spread is the larger one of both groups for returns, the better group's for paces (a bad behaviour may be
-//! irregular), the other group's where a group has one trajectory only. Cut trajectories count in a group's values only
-//! where it has no whole ones. Trajectories that did not make the split join a group: whole ones by their return; cut ones go
-//! to the worse group only if it had earned about as much at the same age, and the pace, if known, is nearer, too.
-//! Everything is kept unless the split is clear and the better group has [`ENOUGH_ROWS`] rows.
+//! For returns, the spread is the larger one of both groups. For paces, it is the better group's (a bad behaviour may
+//! be irregular), or the other group's if a group has only one trajectory. Cut trajectories count in a group's values
+//! only if the group has no whole ones. Trajectories that were not part of the split are assigned to a group
+//! afterwards: whole ones by their return; cut ones to the worse group only if that group had earned about as much at
+//! the same age, and their pace, if known, is also closer to it. Everything is kept unless the split is clear and the
+//! better group has [`ENOUGH_ROWS`] rows.
 
 use serde::Serialize;
 
 use crate::{Episode, Transitions};
 
-/// The gap between two groups, in spreads within a group, from which they count as two behaviours.
+/// The smallest gap, in units of the spread within a group, at which two groups count as two behaviours.
 pub const CLEAR_GAP: f64 = 2.0;
 
-/// The fewest rows that are worth learning from alone.
+/// The fewest rows that are enough to learn from.
 pub const ENOUGH_ROWS: usize = 500;
 
-/// Mean returns (and mean paces, where the pace decides alone) of two behaviours differ by this share of the larger one.
+/// Mean returns (and mean paces, if the pace decides alone) of two behaviours differ by this share of the larger one.
 const LEAST_DIFFERENCE: f64 = 0.15;
-/// Of the clear gap: what is asked of either measure where both tell, and of returns where they tell alone.
+/// Factors on the clear gap: for either measure if both are used, and for returns if they decide alone.
 const BOTH: f64 = 0.6;
 const ALONE: f64 = 1.5;
 
-/// What a split was made by.
+/// The measure that a split is based on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Measure {
@@ -63,11 +65,11 @@ pub enum Measure {
 pub struct Choice {
     /// The rows to learn from, ascending; for [`Transitions::select`].
     pub rows: Vec<usize>,
-    /// The trajectories that they make up, in row order.
+    /// The trajectories that contain these rows, in row order.
     pub episodes: Vec<Episode>,
-    /// Half way between the groups, in units of the measure; `None` if everything was kept.
+    /// Midpoint between the groups, in units of the measure; `None` if everything was kept.
     pub threshold: Option<(Measure, f64)>,
-    /// One sentence for people.
+    /// The reason, as one sentence for users.
     pub reason: String,
 }
 
@@ -78,12 +80,12 @@ impl Choice {
     }
 }
 
-/// Chooses with [`CLEAR_GAP`].
+/// Chooses trajectories with [`CLEAR_GAP`].
 pub fn choose_trajectories(data: &Transitions) -> Choice {
     choose_trajectories_with(data, CLEAR_GAP)
 }
 
-/// Chooses; `clear_gap` is the setting c: larger keeps everything more often, infinity always.
+/// Chooses trajectories. `clear_gap` is the setting c: a larger value keeps everything more often, infinity always.
 pub fn choose_trajectories_with(data: &Transitions, clear_gap: f64) -> Choice {
     let trajectories = measure(data);
     let mut too_few = None;
@@ -112,7 +114,7 @@ pub fn choose_trajectories_with(data: &Transitions, clear_gap: f64) -> Choice {
     }
 }
 
-/// A trajectory and what is known about it.
+/// A trajectory and its measures.
 struct Trajectory {
     episode: Episode,
     /// Its return, if it is whole.
@@ -151,8 +153,8 @@ fn measure(data: &Transitions) -> Vec<Trajectory> {
     episodes.into_iter().map(of).collect()
 }
 
-/// The median of the means of windows, each four fifths over the one before. A trajectory with a pace is never shorter
-/// than a window: a quarter against a tenth.
+/// The median of the means of windows that overlap by four fifths. A trajectory with a pace is never shorter than a
+/// window: it has at least a quarter of the longest length, a window a tenth.
 fn pace(rewards: &[f32], window: usize) -> f64 {
     let mean = |w: &[f32]| w.iter().map(|&r| r as f64).sum::<f64>() / w.len() as f64;
     let mut means: Vec<f64> = rewards.windows(window).step_by((window / 5).max(1)).map(mean).collect();
@@ -161,15 +163,15 @@ fn pace(rewards: &[f32], window: usize) -> f64 {
     if n == 0 { mean(rewards) } else { (means[(n - 1) / 2] + means[n / 2]) / 2.0 }
 }
 
-/// The split of least variance by `measure` (of whole trajectories only, or of all that have it): per trajectory, whether it is in the better group. `None` if all values are
-/// equal or fewer than two trajectories have one.
+/// The split of least variance by `measure` (of whole trajectories only, or of all that have it): for each trajectory,
+/// whether it is in the better group. `None` if all values are equal or fewer than two trajectories have one.
 fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whole_only: bool) -> Option<Vec<bool>> {
     let value = |t: &Trajectory| t.value(measure).filter(|_| !whole_only || t.whole.is_some());
     let mut known: Vec<(f64, f64)> = trajectories.iter().filter_map(|t| Some((value(t)?, t.len() as f64))).collect();
     known.sort_by(|a, b| a.0.total_cmp(&b.0));
     let total: f64 = known.iter().map(|k| k.1).sum();
     let mean = known.iter().map(|k| k.0 * k.1).sum::<f64>() / total;
-    // The largest variance between the groups is the least within them.
+    // The largest variance between the groups gives the smallest variance within them.
     let (mut weight, mut sum) = (0.0, 0.0);
     let mut best: Option<(f64, f64)> = None;
     for pair in known.windows(2) {
@@ -189,7 +191,7 @@ fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whol
                 let mean = |group| mean_of(trajectories, &known, group, |t| t.whole);
                 Some((r - mean(true)?).abs() < (r - mean(false)?).abs())
             });
-            // A cut one is left out only if nothing speaks for it.
+            // A cut trajectory is left out only if neither test puts it in the better group.
             let by_pace = t.pace.and_then(|pace| {
                 let mean = |group| mean_of(trajectories, &known, group, |t| t.pace);
                 Some((pace - mean(true)?).abs() < (pace - mean(false)?).abs())
@@ -197,11 +199,11 @@ fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whol
             better[k] = whole.or_else(|| Some(by_age(data, trajectories, &known, t)? || by_pace == Some(true)));
         }
     }
-    // What nothing is known about is kept: no fall is in it.
+    // A trajectory without any measure is kept: it shows no fall.
     Some(better.into_iter().map(|b| b.unwrap_or(true)).collect())
 }
 
-/// The group whose members had earned about as much at the age at which `cut` was cut.
+/// The group (`true`: the better one) whose members had earned about as much at the age at which `cut` was cut.
 fn by_age(data: &Transitions, trajectories: &[Trajectory], known: &[Option<bool>], cut: &Trajectory) -> Option<bool> {
     let earned = |t: &Trajectory| {
         let start = t.episode.start;
@@ -211,7 +213,7 @@ fn by_age(data: &Transitions, trajectories: &[Trajectory], known: &[Option<bool>
     let distance = |group| mean_of(trajectories, known, group, earned).map(|m: f64| (own - m).abs());
     match (distance(true), distance(false)) {
         (Some(better), Some(worse)) => Some(better <= worse),
-        // Older than any of one group ever got.
+        // `cut` is older than any trajectory of one group.
         (Some(_), None) => Some(true),
         (None, Some(_)) => Some(false),
         (None, None) => None,
@@ -232,7 +234,7 @@ fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// The values of one group in one measure.
+/// Statistics of one group's values in one measure.
 struct Group {
     count: usize,
     mean: f64,
@@ -243,7 +245,7 @@ struct Group {
 impl Group {
     fn of(trajectories: &[Trajectory], better: &[bool], group: bool, measure: Measure) -> Option<Group> {
         let of_group = || trajectories.iter().zip(better).filter(|(_, b)| **b == group).map(|(t, _)| t);
-        // A cut trajectory is a younger one: it counts only where there is no whole one.
+        // Cut trajectories count only if the group has no whole ones.
         let whole = of_group().filter(|t| t.whole.is_some()).filter_map(|t| t.value(measure));
         let mut values: Vec<f64> = whole.collect();
         if values.is_empty() {
@@ -259,7 +261,7 @@ impl Group {
     }
 }
 
-/// The gap between two groups in spreads, negative if they overlap.
+/// The gap between two groups in units of the spread; negative if they overlap.
 fn gap(worse: &Group, better: &Group, measure: Measure) -> f64 {
     let spread = match measure {
         Measure::Pace if better.count > 1 => better.spread(),
@@ -269,7 +271,7 @@ fn gap(worse: &Group, better: &Group, measure: Measure) -> f64 {
     if unit > 0.0 { (better.low - worse.high) / unit } else { 0.0 }
 }
 
-/// Whether `better`'s mean lies over `worse`'s by this share of the larger one.
+/// Whether `better`'s mean exceeds `worse`'s by this share of the larger one.
 fn differ(worse: &Group, better: &Group, share: f64) -> bool {
     better.mean - worse.mean >= share * better.mean.abs().max(worse.mean.abs())
 }
@@ -288,7 +290,7 @@ fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_g
     let (by_return, by_pace) = (size(&returns, Measure::Return), size(&paces, Measure::Pace));
     let paces_differ = paces.as_ref().is_some_and(|(w, b)| differ(w, b, LEAST_DIFFERENCE));
     let paces_differ_a_little = paces.as_ref().is_some_and(|(w, b)| differ(w, b, LEAST_DIFFERENCE / 3.0));
-    // A lone better one may be luck: its return has to stand out, too, where it is known.
+    // A single better trajectory may be luck: if its return is known, it must be clearly better, too.
     let lone = returns.as_ref().is_some_and(|(_, b)| b.count == 1) && by_return < BOTH * clear_gap;
     let pace = by_pace >= clear_gap && paces_differ && !lone;
     let both = paces_differ_a_little && by_return.min(by_pace) >= BOTH * clear_gap;
@@ -301,7 +303,7 @@ fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_g
     (pace || both || alone).then_some((worse.high + better.low) / 2.0)
 }
 
-/// A number as a word, as far as such words are short.
+/// A number as a word, if the word is short.
 fn word(n: usize) -> String {
     const WORDS: [&str; 13] =
         ["none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"];
@@ -313,7 +315,7 @@ fn capitalised(text: &str) -> String {
     letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
 }
 
-/// `1290 to 1310`, or one number where both read the same.
+/// `1290 to 1310`, or one number if both are printed the same.
 fn range(low: f64, high: f64) -> String {
     let digits = if low.abs().max(high.abs()) < 100.0 { 2 } else { 0 };
     let (low, high) = (format!("{low:.digits$}"), format!("{high:.digits$}"));

@@ -1,11 +1,11 @@
-//! The one table every other crate reads and writes.
+//! The table of transitions that every other crate reads and writes.
 
 use std::borrow::Cow;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The four robots of the benchmark. People's own data need no agent: only a state and an action dimension.
+/// The four robots of the benchmark. Users' own data need no agent, only a state and an action dimension.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Agent {
@@ -52,7 +52,7 @@ impl fmt::Display for Agent {
 /// `len` transitions (s, a, r, s', terminal) in columns, each row-major.
 ///
 /// Rows are in time order within an episode; [`Transitions::timeouts`] and [`Transitions::terminals`] mark where
-/// episodes end. Data without an order (generated rows) are a table whose every row is its own episode.
+/// episodes end. In data without an order (generated rows), every row is its own episode.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Transitions {
     /// State dimension d_s.
@@ -69,10 +69,11 @@ pub struct Transitions {
     pub next_observations: Vec<f32>,
     /// Whether s' is absorbing, `[len]`. A time-out is not a terminal.
     pub terminals: Vec<bool>,
-    /// Whether the episode was cut after this row for another reason than a terminal, `[len]`.
+    /// Whether the episode was cut after this row for a reason other than a terminal, `[len]`.
     pub timeouts: Vec<bool>,
-    /// Whether s' is known, `[len]`. Where it is not, the row is terminal and `next_observations` repeats s: enough for whoever learns
-    /// values or imitates, nothing for whoever learns the dynamics ([`Transitions::with_successors`]).
+    /// Whether s' is known, `[len]`. If it is not, the row is terminal and `next_observations` repeats s. Such rows are
+    /// usable for learning values and for imitation, but not for learning the dynamics
+    /// ([`Transitions::with_successors`]).
     pub known: Vec<bool>,
 }
 
@@ -160,8 +161,8 @@ impl Transitions {
         self.known.extend_from_slice(&other.known);
     }
 
-    /// The rows at `indices`, in that order. A row whose successor in this table is not its successor in the selection
-    /// gets its `timeout` mark, so that episodes are not glued together.
+    /// The rows at `indices`, in that order. If the row that follows a row here does not follow it in the selection,
+    /// the row gets a `timeout` mark, so that separate episodes are not joined.
     pub fn select(&self, indices: &[usize]) -> Transitions {
         let mut out = Transitions::with_capacity(self.obs_dim, self.act_dim, indices.len());
         for (k, &i) in indices.iter().enumerate() {

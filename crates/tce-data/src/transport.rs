@@ -1,15 +1,16 @@
-//! Optimal-transport cost of every source row, in OTDF's form: entropic transport between a block of source rows and
-//! all target rows, with the cosine cost on [s, a, s'].
+//! Optimal-transport cost of every source row, as in OTDF: entropic transport between a block of source rows and all
+//! target rows, with the cosine cost on [s, a, s'].
 //!
 //! C_ij = 1 - cos(x_i, y_j); ε = `relative_epsilon` · mean(C) (scaling C by its maximum, as OTDF does, cancels); uniform
 //! marginals a = 1/n, b = 1/m; Sinkhorn iterations, target side first:
 //! g_j = ε log b - ε LSE_i((f_i - C_ij)/ε), f_i = ε log a - ε LSE_j((g_j - C_ij)/ε); P_ij = exp((f_i + g_j - C_ij)/ε).
 //!
-//! OTDF casts the costs to float16 before; here all is computed in float32 and float64. What half precision does to plans with
-//! entries near 2e-8 (a ten-thousandth times a five-thousandth), below its smallest normal number, was not tried.
+//! OTDF casts the costs to float16 first; here everything is computed in float32 and float64. Untested: how half
+//! precision affects plans with entries near 2e-8 (a ten-thousandth times a five-thousandth), below its smallest normal
+//! number.
 //!
-//! The first iteration, and any in which the scalings grow too large, is done on logarithms; the others scale the kernel
-//! P/a of the last such step by u and v: one pass over it per iteration.
+//! The first iteration, and any in which the scalings grow too large, works on logarithms. The other iterations scale
+//! the kernel P/a of the last such step by u and v, with one pass over it per iteration.
 
 use rayon::prelude::*;
 use tce_base::{Interrupted, Progress};
@@ -17,28 +18,28 @@ use tce_base::{Interrupted, Progress};
 use crate::product::Transposed;
 use crate::{DataError, Rows};
 
-/// Source rows per partial sum. Part of the definition of the result: partial sums are added in chunk order.
+/// Source rows per partial sum. It is part of the definition of the result: partial sums are added in chunk order.
 const CHUNK: usize = 256;
-/// Source rows whose costs are computed at once.
+/// Source rows whose costs are computed together.
 const TILE: usize = 32;
-/// Scalings beyond this move into the logarithms.
+/// Larger scalings are moved into the logarithms.
 const SCALING_LIMIT: f64 = 1e12;
-/// Iterations between two looks at the marginals.
+/// Iterations between two checks of the marginals.
 const CHECK_EVERY: usize = 10;
 
-/// See [`transport_costs`]. The default is OTDF's.
+/// See [`transport_costs`]. The defaults are OTDF's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TransportOptions {
     /// Source rows per transport problem.
     pub block_rows: usize,
     /// ε in units of the mean cost of the block.
     pub relative_epsilon: f64,
-    /// Largest L1 error of the target marginal at which the iterations may end (looked at every tenth).
+    /// Largest L1 error of the target marginal at which the iterations may stop (checked every tenth iteration).
     pub threshold: f64,
-    /// Most iterations per block.
+    /// Largest number of iterations per block.
     pub max_iterations: usize,
-    /// Multiply by the block's number of rows: the mean cost along a row's transport, comparable between blocks of
-    /// different sizes. OTDF does not, so the rows of its shorter last block look too expensive.
+    /// Multiply by the block's number of rows. This gives the mean cost along a row's transport, comparable between
+    /// blocks of different sizes. OTDF does not, so the rows of its shorter last block look too expensive.
     pub per_row: bool,
 }
 
@@ -48,7 +49,7 @@ impl Default for TransportOptions {
     }
 }
 
-/// The transport cost Σ_j P_ij C_ij of every source row, `[source.len()]`, not negative; smaller is closer to the target.
+/// The transport cost Σ_j P_ij C_ij of every source row, `[source.len()]`, not negative; small: close to the target.
 ///
 /// Independent of the number of threads. Memory: 4 · `block_rows` · `target.len()` bytes.
 ///
@@ -82,7 +83,7 @@ pub fn transport_costs(
     Ok(out)
 }
 
-/// Rows of length 1 (a zero row stays zero: its cosine with everything is 0).
+/// Scales rows to length 1 (a zero row stays zero: its cosine with everything is 0).
 fn unit_rows(rows: &Rows<'_>, range: std::ops::Range<usize>) -> Vec<f32> {
     let mut out = vec![0.0; range.len() * rows.dim()];
     rows.copy_rows(range, &mut out);
@@ -105,9 +106,9 @@ struct Block<'a> {
     inverse_epsilon: f64,
 }
 
-/// P_ij = u_i K_ij v_j, and what the next step needs.
+/// The plan P_ij = u_i K_ij v_j, and what the next step needs.
 struct State {
-    /// F_i = f_i / ε of the last step on logarithms, to which K belongs.
+    /// F_i = f_i / ε of the last step on logarithms, from which K was computed.
     log_f: Vec<f64>,
     log_g: Vec<f64>,
     u: Vec<f64>,
@@ -126,7 +127,7 @@ impl<'a> Block<'a> {
         block
     }
 
-    /// One value per chunk of source rows, in order; every thread gets a tile buffer.
+    /// Returns one value per chunk of source rows, in order. Every thread gets a tile buffer.
     fn chunks<T: Send>(&self, work: impl Fn(&Self, std::ops::Range<usize>, &mut [f32]) -> T + Sync) -> Vec<T> {
         (0..self.n.div_ceil(CHUNK))
             .into_par_iter()
@@ -149,7 +150,7 @@ impl<'a> Block<'a> {
                 let end = range.end.min(i + TILE);
                 let costs = &mut tile[..(end - i) * self.m];
                 self.target.dot(&self.rows[i * d..end * d], 0, self.m, -1.0, costs);
-                // Rounding may push the cosine of parallel rows above 1.
+                // Rounding may make the cosine of parallel rows larger than 1.
                 costs.iter_mut().for_each(|c| *c = (1.0 + *c).max(0.0));
                 work(i, costs)
             })
@@ -191,7 +192,7 @@ impl<'a> Block<'a> {
         self.restart_rows(log_g, kernel)
     }
 
-    /// Per column j over some rows: the largest F_i - C_ij/ε, and the sum of the exponentials relative to it.
+    /// For each column j over some rows: the largest F_i - C_ij/ε, and the sum of the exponentials relative to it.
     fn column_sums(&self, rows: std::ops::Range<usize>, tile: &mut [f32], log_f: &[f64]) -> (Vec<f32>, Vec<f64>) {
         let mut top = vec![f32::NEG_INFINITY; self.m];
         let mut sums = vec![0.0f64; self.m];
@@ -219,7 +220,7 @@ impl<'a> Block<'a> {
         (top, sums)
     }
 
-    /// The row half of an iteration on logarithms: F from G, and K.
+    /// The row half of an iteration on logarithms: computes F from G, and K.
     fn restart_rows(&self, log_g: Vec<f64>, kernel: &mut [f32]) -> State {
         let a = 1.0 / self.n as f64;
         let parts: Vec<(Vec<f64>, Vec<f64>)> = kernel
@@ -314,7 +315,7 @@ impl<'a> Block<'a> {
     }
 }
 
-/// Σ_i u_i K_ij: float32 within a few dozen rows, float64 beyond.
+/// Σ_i u_i K_ij, summed in float32 within a few dozen rows and in float64 beyond.
 struct Columns {
     near: Vec<f32>,
     far: Vec<f64>,

@@ -1,4 +1,4 @@
-//! Rows that are in memory: NumPy arrays, or whatever another program has.
+//! Rows that are already in memory, for example NumPy arrays.
 
 use std::path::Path;
 
@@ -8,11 +8,11 @@ use super::options::LoadOptions;
 use super::successors::{fill_gaps, layout_of, told_gaps};
 use crate::{DataError, Problem};
 
-/// Validates `columns` as [`load`](crate::load) does a file with the same ones, and puts right what it puts right; `name` is what messages
-/// call them.
+/// Validates and corrects `columns` exactly as [`load`](crate::load) does for a file with the same columns. Error
+/// messages and warnings use `name` for the table.
 ///
 /// # Errors
-/// No rows or no columns, columns of different lengths, NaN or infinity, other dimensions than those asked for.
+/// No rows or no columns, columns of different lengths, NaN or infinity, dimensions other than the expected ones.
 pub fn from_columns(mut columns: Columns, name: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     let (obs_dim, act_dim, rows) = (columns.obs_dim, columns.act_dim, columns.rewards.len());
     let invalid = |problem, field: &str, found: String, expected: String, advice: &str| {
@@ -73,7 +73,7 @@ mod tests {
 
     use super::*;
 
-    /// Two episodes of three rows; the state counts on within each.
+    /// Two episodes of three rows; the state increases by one step within each.
     fn columns() -> Columns {
         Columns {
             obs_dim: 1,
@@ -99,7 +99,7 @@ mod tests {
         crate::save_d4rl(&path, &loaded.transitions, &BTreeMap::new(), &[]).unwrap();
         assert_eq!(crate::load(&path, &LoadOptions::default()).unwrap().transitions, loaded.transitions);
         assert_eq!(loaded.transitions.episodes().iter().map(|e| e.end).collect::<Vec<_>>(), [3, 6]);
-        // Without successors they come from the next row, and the last row has none.
+        // If there are no successors, s' is the next row's state, and the last row has none.
         let without = load(Columns { next_observations: None, ..columns() }).unwrap();
         assert_eq!(without.transitions.next_observations[..2], [1.0, 2.0]);
         assert_eq!(without.report.dropped.last_row, 1);

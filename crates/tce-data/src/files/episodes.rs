@@ -1,9 +1,10 @@
-//! Where episodes end, in which order the rows are, and which successors are known. Facts about the public files: `datasets.md`.
+//! Finds the ends of episodes, the order of the rows and the known successors. Facts about the public files:
+//! `datasets.md`.
 //!
-//! A file says it in up to three ways: by its marks (`terminals`, `timeouts`), by continuity (is the stored s'ᵢ the state of the next
-//! row?), and by a step limit that the caller knows. Continuity is compared within a tolerance of each column's own scale
-//! ([`Continuity`]), because successors are often stored with fewer digits. Where marks and continuity contradict each other,
-//! continuity wins, and the contradiction is told with row numbers.
+//! There are up to three sources: marks (`terminals`, `timeouts`), continuity (is the stored s'ᵢ the state of the next
+//! row?), and a step limit that the caller passes. Continuity is tested within a tolerance per column ([`Continuity`]),
+//! because successors are often stored with fewer digits. If marks and continuity contradict each other, continuity
+//! wins, and a warning gives the rows.
 
 use std::cell::LazyCell;
 
@@ -14,23 +15,23 @@ use super::report::{EpisodeEnds, Successors};
 use super::rows::tell;
 use super::steps::{Steps, doubts, in_place};
 
-/// Rows of one step of `k` environments in turn are looked for up to this many environments.
+/// Largest number of interleaved environments (one row of each per step) that is searched for.
 const MOST_ENVIRONMENTS: usize = 1024;
-/// Rows that are looked at for a column's scale.
+/// Number of rows from which a column's scale is estimated.
 const SAMPLE: usize = 20_000;
 
-/// Whether two states are the same, up to how they are rounded.
+/// Tests whether two states are the same up to rounding.
 ///
-/// A column's tolerance is a tenth of its median step, at most a hundredth of its spread; or three times what nine tenths of the
-/// successors miss the next row by, at most a fiftieth of its spread; and at least what float32 and six digits leave. A reset that hits the next
-/// state in every column this closely is no break.
+/// A column's tolerance is the largest of: a tenth of its median step, at most a hundredth of its spread; three times
+/// the 90 % quantile of |s'ᵢ - sᵢ₊₁|, at most a fiftieth of its spread; the rounding error of float32 and six digits. A
+/// reset to a state this close to the next one in every column is not seen as a break.
 struct Continuity<'a> {
     table: &'a Table<'a>,
     next: &'a [f32],
     tolerance: &'a [f32],
 }
 
-/// The tolerance of each column; empty where there are no stored successors.
+/// The tolerance of each column; empty if the file stores no successors.
 pub(super) fn tolerance(table: &Table<'_>) -> Vec<f32> {
     let Some(next) = table.next_observations else { return Vec::new() };
     let (d, n) = (table.dim, table.terminals.len());
@@ -44,7 +45,7 @@ pub(super) fn tolerance(table: &Table<'_>) -> Vec<f32> {
         let mut steps: Vec<f64> = sample.iter().map(|&i| (f64::from(next[i * d + k]) - s(i)).abs()).collect();
         let middle = steps.len() / 2;
         let step = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
-        // What nine tenths of the successors miss the next row by is how they were rounded.
+        // The 90 % quantile of |s'ᵢ - sᵢ₊₁| measures how the successors were rounded.
         let miss = |&i: &usize| (f64::from(next[i * d + k]) - f64::from(table.observations[(i + 1) * d + k])).abs();
         let mut misses: Vec<f64> = sample.iter().filter(|i| **i + 1 < n).map(miss).collect();
         let at = misses.len() * 9 / 10;
@@ -56,7 +57,7 @@ pub(super) fn tolerance(table: &Table<'_>) -> Vec<f32> {
 }
 
 impl Continuity<'_> {
-    /// Whether there is a row i + lag and the stored successor of row i is its state.
+    /// Whether row i + lag exists and its state is the stored successor of row i.
     fn joined(&self, i: usize, lag: usize) -> bool {
         let d = self.table.dim;
         if i + lag >= self.table.terminals.len() {
@@ -67,20 +68,19 @@ impl Continuity<'_> {
         same_bits(next, state) || next.iter().zip(state).zip(self.tolerance).all(|((a, b), t)| (a - b).abs() <= *t)
     }
 
-    /// For every row whether the next one continues it.
+    /// For every row, whether the next row continues it.
     fn all(&self) -> Vec<bool> {
         (0..self.table.terminals.len()).into_par_iter().map(|i| self.joined(i, 1)).collect()
     }
 }
 
-/// Sixteen columns at a time, which takes a few instructions; most rows are joined and have the same bits.
+/// Compares sixteen columns at a time, which takes a few instructions. Most rows are continued and have the same bits.
 fn same_bits(a: &[f32], b: &[f32]) -> bool {
     let differ = |(a, b): (&[f32], &[f32])| a.iter().zip(b).fold(0, |bits, (a, b)| bits | (a.to_bits() ^ b.to_bits()));
     a.chunks(16).zip(b.chunks(16)).all(|pair| differ(pair) == 0)
 }
 
-/// How many environments take turns in the rows: s'ᵢ is the state of row i + k and not of row i + 1. One, where nothing says
-/// otherwise.
+/// The number k of interleaved environments: s'ᵢ is the state of row i + k and not of row i + 1. The default is 1.
 pub(super) fn environments(table: &Table<'_>, tolerance: &[f32]) -> usize {
     let n = table.terminals.len();
     let Some(next) = table.next_observations else { return 1 };
@@ -97,12 +97,12 @@ pub(super) fn environments(table: &Table<'_>, tolerance: &[f32]) -> usize {
     lags.into_iter().find(|&lag| share(lag) > 0.5).unwrap_or(1)
 }
 
-/// The rows of `n` in the order of `environments` environments, one after the other.
+/// The indices of `n` interleaved rows, sorted by environment.
 pub(super) fn untangled(n: usize, environments: usize) -> Vec<usize> {
     (0..environments).flat_map(|k| (k..n).step_by(environments)).collect()
 }
 
-/// Whether a row that ends no episode has another successor than the next row.
+/// Whether some row that does not end an episode has a successor other than the next row's state.
 pub(super) fn has_unmarked_ends(table: &Table<'_>) -> bool {
     let (Some(next), Some(timeouts)) = (table.next_observations, table.timeouts) else { return true };
     let tolerance = tolerance(table);
@@ -111,7 +111,7 @@ pub(super) fn has_unmarked_ends(table: &Table<'_>) -> bool {
     (0..last).into_par_iter().any(|i| !table.terminals[i] && !timeouts[i] && !continuity.joined(i, 1))
 }
 
-/// Decides, for rows that are in their order.
+/// Decides where episodes end and which successors are known. The rows must be in order.
 pub(super) fn resolve(table: &Table<'_>, tolerance: &[f32], environments: usize) -> Resolved {
     match (table.next_observations, table.timeouts) {
         (Some(next), timeouts) => {
@@ -146,7 +146,7 @@ pub(super) fn resolve(table: &Table<'_>, tolerance: &[f32], environments: usize)
     }
 }
 
-/// The last rows of environments that were put one after the other are followed by another one's rows.
+/// Marks the last row of each environment as not continued: another environment's rows follow.
 fn cut_between(joined: &mut [bool], environments: usize) {
     let n = joined.len();
     let mut end = 0;
@@ -156,7 +156,7 @@ fn cut_between(joined: &mut [bool], environments: usize) {
     }
 }
 
-/// A file with stored successors and `timeouts`.
+/// Handles a file with stored successors and `timeouts`.
 fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     let last = table.terminals.len() - 1;
     let rows_of = |what: &dyn Fn(usize) -> bool| (0..last).filter(|&i| what(i)).collect::<Vec<_>>();
@@ -165,7 +165,7 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     let joined_ends = rows_of(&|i| ended(i) && joined[i]);
     let joined_timeouts = rows_of(&|i| timeouts[i] && !table.terminals[i] && joined[i]);
     let breaks = rows_of(&|i| !ended(i) && !joined[i]);
-    // Only doubtful files are measured.
+    // Computed only for doubtful files.
     let steps = LazyCell::new(|| Steps::new(table));
     if breaks.len() * 2 > last.max(1) && steps.in_order() {
         let mut out = Resolved::new(timeouts.to_vec(), Successors::Stored, EpisodeEnds::Marks);
@@ -178,7 +178,7 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
         out.warnings.push(no_order(breaks.len(), last));
         return out;
     }
-    // Successors built as the next row are that at every end, nowhere does anything else end, and the step there is none of the robot's.
+    // Signs of successors built from the next row: equal to it at every end, no other breaks, the state jumps there.
     let many = joined_ends.len() * 10 > last.max(10);
     if joined_ends.len() * 2 > ends.len()
         && breaks.len() * 4 < joined_ends.len()
@@ -192,7 +192,7 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     let marks = rows_of(&|i| timeouts[i]);
     let mut out = Resolved::new(timeouts.to_vec(), Successors::Stored, EpisodeEnds::Marks);
     if (0..last).all(|i| joined[i]) {
-        // Such successors tell nothing that the next rows do not.
+        // Such successors carry no more information than the next rows.
         let moved = in_place(table, timeouts, &mut out.warnings);
         if moved != timeouts {
             let mut told = std::mem::take(&mut out.warnings);
@@ -212,7 +212,7 @@ fn by_marks(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     out
 }
 
-/// Follows the `breaks` between states where the `marks` of time-outs contradict them. `joined_timeouts` are marks that the next row continues.
+/// Prefers the `breaks` between states to the time-out `marks`; `joined_timeouts`: marks that the next row continues.
 fn reconcile(out: &mut Resolved, marks: &[usize], joined_timeouts: &[usize], breaks: &[usize]) {
     if joined_timeouts.len() * 2 > marks.len() {
         joined_timeouts.iter().for_each(|&i| out.timeouts[i] = false);
@@ -224,7 +224,7 @@ fn reconcile(out: &mut Resolved, marks: &[usize], joined_timeouts: &[usize], bre
             tell(breaks)
         ));
     } else {
-        // A mark one row from where an episode visibly ends is that end's.
+        // A mark one row away from a visible end belongs to that end.
         let beside = |i: &&usize| {
             breaks.binary_search(&(**i + 1)).is_ok() || **i > 0 && breaks.binary_search(&(**i - 1)).is_ok()
         };
@@ -246,7 +246,7 @@ fn reconcile(out: &mut Resolved, marks: &[usize], joined_timeouts: &[usize], bre
     }
 }
 
-/// Told where a terminal row is followed by its own successor, which is terminal as well.
+/// Warns if a terminal row is followed by its own successor, which is also terminal.
 fn held_terminals(table: &Table<'_>, joined: &[bool]) -> Option<String> {
     let t = table.terminals;
     let held: Vec<usize> = (0..t.len().saturating_sub(1)).filter(|&i| t[i] && t[i + 1] && joined[i]).collect();
@@ -266,7 +266,7 @@ fn elsewhere(breaks: usize, n: usize) -> String {
     )
 }
 
-/// A file whose stored successors are the next row's state even where an episode ends: there, nobody knows them.
+/// Handles a file whose stored successors are the next row's state even at ends, where the true ones are unknown.
 fn rebuilt(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     let last = table.terminals.len() - 1;
     let mut out = Resolved::new(timeouts.to_vec(), Successors::NextRow, EpisodeEnds::Marks);
@@ -286,16 +286,16 @@ fn rebuilt(table: &Table<'_>, timeouts: &[bool], joined: &[bool]) -> Resolved {
     out
 }
 
-/// A file with stored successors and without `timeouts`.
+/// Handles a file with stored successors and without `timeouts`.
 ///
-/// An episode ends at a terminal, after `limit` steps, where s'ᵢ ≠ sᵢ₊₁, and at the last row. Where the stored successor of a row that
-/// ended by a terminal or by the limit is the following row's state, it was built as sᵢ₊₁ and is the next episode's first state;
-/// then a last row that ended so has one that was made up in some other way.
+/// An episode ends at a terminal, after `limit` steps, where s'ᵢ ≠ sᵢ₊₁, and at the last row. If an episode ended by a
+/// terminal or the limit and its last stored successor is the following row's state, that successor was built as sᵢ₊₁
+/// and is wrong: it is the next episode's first state. A last row that ended so then has a wrong successor, too.
 fn by_continuity(table: &Table<'_>, joined: &[bool]) -> Resolved {
     let n = table.terminals.len();
     let breaks = (0..n - 1).filter(|&i| !joined[i] && !table.terminals[i]).count();
     let displaced = displaced_terminals(table, joined);
-    // Only doubtful files are measured.
+    // Computed only for doubtful files.
     let steps = LazyCell::new(|| Steps::new(table));
     if breaks * 2 > n && steps.in_order() {
         let mut out = Resolved::new(vec![false; n], Successors::Stored, EpisodeEnds::Terminals);
@@ -311,7 +311,7 @@ fn by_continuity(table: &Table<'_>, joined: &[bool]) -> Resolved {
     let (mut any, mut start) = (false, 0);
     for (i, &continues) in joined.iter().enumerate() {
         let by_limit = Some(i + 1 - start) == table.limit;
-        // Where the step after a terminal is one of the robot's, its successor is right.
+        // If the state does not jump after a terminal, its stored successor is right.
         let over = by_limit || (table.terminals[i] && rebuilt);
         if over || table.terminals[i] || !continues {
             out.timeouts[i] = !table.terminals[i];
@@ -341,7 +341,7 @@ fn by_continuity(table: &Table<'_>, joined: &[bool]) -> Resolved {
     out
 }
 
-/// Told where most terminals are followed by their own successor, while an episode visibly ends in the row before or after.
+/// Warns if most terminals are followed by their own successor, while an episode visibly ends one row before or after.
 fn displaced_terminals(table: &Table<'_>, joined: &[bool]) -> Option<String> {
     let last = table.terminals.len() - 1;
     let terminals: Vec<usize> = (0..last).filter(|&i| table.terminals[i]).collect();
@@ -364,8 +364,8 @@ fn no_order(breaks: usize, n: usize) -> String {
     )
 }
 
-/// D4RL's `qlearning_dataset` for files without successors: s'ᵢ = sᵢ₊₁. Time-out rows have none and are dropped, with the last row.
-/// Terminal rows have none either, but nothing is bootstrapped there: they stay, marked.
+/// D4RL's `qlearning_dataset` for files without successors: s'ᵢ = sᵢ₊₁. Time-out rows and the last row have no
+/// successor and are dropped. Terminal rows have none either, but nothing is bootstrapped there: they stay, marked.
 fn next_rows(table: &Table<'_>, timeouts: Vec<bool>, ends: EpisodeEnds) -> Resolved {
     let last = timeouts.len() - 1;
     let mut out = Resolved::new(timeouts, Successors::NextRow, ends);
@@ -381,8 +381,7 @@ fn next_rows(table: &Table<'_>, timeouts: Vec<bool>, ends: EpisodeEnds) -> Resol
     out
 }
 
-/// Rows after which an episode was cut by the step limit, for a file that has neither `timeouts` nor `next_observations`: D4RL counts
-/// steps.
+/// Marks rows where the step limit cut an episode, as D4RL does, for files without `timeouts` and `next_observations`.
 fn count_timeouts(terminals: &[bool], limit: Option<usize>) -> Vec<bool> {
     let mut steps = 0;
     let full = |&terminal: &bool| {

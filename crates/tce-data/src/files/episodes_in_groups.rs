@@ -1,5 +1,5 @@
-//! What layouts with a group an episode have in common: the groups in the order of their numbers, and fields that may be groups of
-//! columns themselves.
+//! Shared code of layouts with one group per episode: the groups in the order of their numbers, and fields that may
+//! themselves be groups of columns.
 
 use std::collections::BTreeMap;
 
@@ -18,17 +18,17 @@ pub(super) fn numbered(file: &Hdf5, parent: &str, prefix: &str) -> Vec<String> {
     numbered.into_iter().map(|(_, name)| name).collect()
 }
 
-/// Groups of a field that stand in each other.
+/// Largest depth of nested groups of a field.
 const DEEPEST: usize = 8;
 
-/// The columns of a field of one episode.
+/// The columns of a field in one episode.
 pub(super) struct Field {
     pub rows: usize,
-    /// Name (empty for a field that is one data set), columns.
+    /// Name (empty for a field that is one data set) and number of columns.
     pub parts: Vec<(String, usize)>,
     /// `[rows, dim]`.
     pub data: Vec<f32>,
-    /// Members that are no columns of numbers (images, text).
+    /// Members that are not columns of numbers (images, text).
     pub left_out: Vec<String>,
 }
 
@@ -38,7 +38,7 @@ impl Field {
         self.parts.iter().map(|p| p.1).sum()
     }
 
-    /// In words: which columns are whose.
+    /// Describes in words which columns belong to which part.
     pub fn describe(&self, field: &str) -> Option<String> {
         let named = self.parts.iter().any(|p| !p.0.is_empty());
         let mut at = 0;
@@ -55,7 +55,7 @@ impl Field {
     }
 }
 
-/// A field: one data set, (N,) or (N, D), or a group of such, laid side by side in the order of their names.
+/// Reads a field: one data set, (N,) or (N, D), or a group of data sets, concatenated in the order of their names.
 pub(super) fn field(file: &Hdf5, path: &str) -> Result<Field, DataError> {
     let (mut columns, mut left_out) = (Vec::<(String, Column)>::new(), Vec::new());
     gather(file, path, "", 0, &mut columns, &mut left_out)?;
@@ -98,7 +98,7 @@ fn gather(
     let Some(mut all) = file.names_in(path)? else {
         match file.table(path) {
             Ok(column) => columns.push((name.to_owned(), column)),
-            // Pictures and words beside the numbers of a state are no fault of the file.
+            // Images and text beside the numbers of a state are not an error.
             Err(e) if !name.is_empty() && matches!(e.problem(), Some(Problem::WrongRank | Problem::WrongType)) => {
                 left_out.push(name.to_owned());
             }
@@ -109,7 +109,7 @@ fn gather(
     // `_index_2` of a tuple comes before `_index_10`.
     let order = |name: &String| (name.strip_prefix("_index_").and_then(|n| n.parse::<u64>().ok()), name.clone());
     all.sort_by_key(order);
-    // A damaged file may hold a group that is its own member.
+    // In a damaged file a group may contain itself.
     if depth > DEEPEST {
         let (found, expected) = (format!("groups in groups, {name}"), format!("at most {DEEPEST} of them"));
         return Err(file.invalid(Problem::Malformed, path, found, expected, "Store the state as columns of numbers"));
@@ -121,7 +121,7 @@ fn gather(
     Ok(())
 }
 
-/// The field of an episode; none for an episode without a step, which is counted.
+/// The field of an episode. `None` for an episode without steps, which is counted in `empty`.
 pub(super) fn unless_empty(field: Result<Field, DataError>, empty: &mut usize) -> Result<Option<Field>, DataError> {
     match field {
         Err(e) if e.problem() == Some(Problem::Empty) => {
@@ -147,7 +147,7 @@ pub(super) struct Together {
 }
 
 impl Together {
-    /// The last words: what was left out.
+    /// Adds the warning about what was left out.
     pub fn finish(&mut self, empty: usize, options: &LoadOptions) {
         if empty > 0 {
             self.warnings.push(format!("{empty} episodes without a step were left out"));
@@ -159,7 +159,7 @@ impl Together {
         }
     }
 
-    /// All of it, as a file's rows.
+    /// All rows, in the form of a file's rows.
     pub fn raw(self, layout: Layout) -> Raw {
         let dim = |parts: &[(String, usize)]| parts.iter().map(|p| p.1).sum();
         let columns = Columns {
@@ -176,7 +176,7 @@ impl Together {
         Raw { layout, columns, known: None, warnings: self.warnings }
     }
 
-    /// Notes what the columns of states and actions are, and refuses an episode with others than those before.
+    /// Records the columns of states and actions; returns an error if they differ from those of earlier episodes.
     pub fn same(&mut self, file: &Hdf5, episode: &str, states: &Field, actions: &Field) -> Result<(), DataError> {
         if self.obs.is_empty() {
             (self.obs, self.act) = (states.parts.clone(), actions.parts.clone());

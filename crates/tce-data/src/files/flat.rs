@@ -1,4 +1,4 @@
-//! Files with one data set a field: D4RL's, OTDF's, and what [`save_d4rl`](super::save_d4rl) writes.
+//! Files with one data set per field: D4RL's, OTDF's, and those that [`save_d4rl`](super::save_d4rl) writes.
 //!
 //! | field | shape | also read under |
 //! |---|---|---|
@@ -28,13 +28,13 @@ const REWARDS: [&str; 2] = ["rewards", "reward"];
 const NEXT: [&str; 3] = ["next_observations", "next_obs", "next_states"];
 const TERMINALS: [&str; 4] = ["terminals", "terminations", "terminated", "terminal"];
 const TIMEOUTS: [&str; 6] = ["timeouts", "truncations", "truncated", "truncateds", "timeout", "infos/timeouts"];
-/// What ends episodes, and does not tell how.
+/// Fields that mark ends of episodes without saying whether they are terminals or time-outs.
 const ANY_END: [&str; 5] = ["dones", "done", "dones_float", "episode_terminals", "ends"];
-/// What may tell where episodes end, and is not read.
+/// Fields that may mark ends of episodes and are not read.
 const HINTS: [&str; 6] =
     ["infos/TimeLimit.truncated", "infos/truncated", "infos/truncations", "truncation", "episode_id", "episode_ids"];
 
-/// The first of `names` that the file has, with a word to the user where it is not the first one.
+/// The first of `names` that the file has. Adds a warning if it is not the first one of the list.
 fn name<'a>(file: &Hdf5, names: &[&'a str], warnings: &mut Vec<String>) -> Option<&'a str> {
     let found = *names.iter().find(|name| file.has(name))?;
     if found != names[0] {
@@ -43,7 +43,7 @@ fn name<'a>(file: &Hdf5, names: &[&'a str], warnings: &mut Vec<String>) -> Optio
     Some(found)
 }
 
-/// What may tell where episodes end, and was not read beside `timeouts`.
+/// Fields that may mark ends of episodes and were not read in addition to `timeouts`.
 fn other_marks(file: &Hdf5, timeouts: Option<&str>) -> Vec<String> {
     let others = TIMEOUTS.iter().filter(|name| file.has(name) && Some(**name) != timeouts);
     let others = others.filter(|_| timeouts.is_some());
@@ -70,7 +70,7 @@ impl Format for Flat {
         warnings.extend(other_marks(file, timeouts));
 
         let (mut stored, mut observed) = (None, None);
-        // The two large columns are inflated side by side, each through a handle of its own.
+        // The two large columns are decompressed in parallel, each through its own handle.
         rayon::scope(|s| {
             if let Some(next) = next {
                 s.spawn(|_| stored = Some(file.reopen().and_then(|f| f.matrix_with_gaps(next))));
@@ -112,7 +112,7 @@ impl Format for Flat {
         let mut known = known;
         if let Some((name, c)) = next.zip(stored.as_mut()) {
             match fill_gaps(&mut c.data, &observed.data, &terminal, &mut known) {
-                // The plain reading says where and what.
+                // The plain read returns an error that says where and what.
                 Err(_) => drop(file.matrix(name)?),
                 Ok(gaps) => warnings.extend(told_gaps(name, gaps)),
             }
@@ -140,7 +140,7 @@ impl Format for Flat {
     }
 }
 
-/// The columns that were asked for; all there are, if all were, with a word about those that cannot be read.
+/// The requested columns. If all are requested: all columns of the file, and a warning about unreadable ones.
 fn further(
     file: &Hdf5,
     options: &LoadOptions,

@@ -1,12 +1,12 @@
-//! The layouts of files, and what all of them come to.
+//! The supported layouts of files, and the form that all of them are read into.
 //!
 //! | layout | known by | its file |
 //! |---|---|---|
-//! | D4RL, OTDF, ours | none of the others | [`super::flat`] |
+//! | D4RL, OTDF, this program's | none of the others | [`super::flat`] |
 //! | Minari | groups `episode_0`, `episode_1`, ... | [`super::minari`] |
 //! | robomimic | a group `data` of groups `demo_0`, `demo_1`, ... | [`super::robomimic`] |
 //!
-//! A further layout is a file with a [`Format`] and a line in `FORMATS` of `load.rs`.
+//! To add a layout, write a file with a [`Format`] and add a line to `FORMATS` in `load.rs`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,16 +16,16 @@ use super::options::LoadOptions;
 use super::report::Layout;
 use crate::{DataError, Problem};
 
-/// One layout.
+/// One file layout.
 pub(super) trait Format: Sync {
-    /// Whether `file` has it, by what the file holds.
+    /// Whether `file` has this layout, judged by its content.
     fn recognises(&self, file: &Hdf5) -> bool;
 
-    /// All rows, before anything is put right or dropped.
+    /// Reads all rows, before anything is corrected or dropped.
     fn read(&self, file: &Hdf5, options: &LoadOptions) -> Result<Raw, DataError>;
 }
 
-/// Columns as a file of D4RL's layout has them, row-major; what every layout is read as.
+/// Columns as in D4RL's layout, row-major. Every layout is read into this form.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Columns {
     /// State dimension.
@@ -38,28 +38,28 @@ pub struct Columns {
     pub actions: Vec<f32>,
     /// r, `[N]`.
     pub rewards: Vec<f32>,
-    /// s', `[N, obs_dim]`; None: the next row's state.
+    /// s', `[N, obs_dim]`; `None`: the next row's state.
     pub next_observations: Option<Vec<f32>>,
     /// Whether s' is absorbing, `[N]`.
     pub terminals: Vec<bool>,
-    /// Whether the episode was cut after the row, `[N]`; None: it is found out.
+    /// Whether the episode was cut after the row, `[N]`; `None`: inferred from the states.
     pub timeouts: Option<Vec<bool>>,
     /// Further columns, `[N]` each.
     pub further: BTreeMap<String, Vec<f32>>,
 }
 
-/// The rows of a file, as they stand there. All columns have one entry per row.
+/// The rows of a file as they are stored. All columns have one entry per row.
 pub(super) struct Raw {
     pub layout: Layout,
     pub columns: Columns,
-    /// Which successors are known, where the file says it.
+    /// Which successors are known, if the file says so.
     pub known: Option<Vec<bool>>,
-    /// What was read of the file in another way than by its plain names, and what was not read.
+    /// What was read other than by its standard name, and what was not read.
     pub warnings: Vec<String>,
 }
 
 impl Raw {
-    /// Refuses other dimensions than `dims`.
+    /// Returns an error if the dimensions differ from `dims`.
     pub fn check_dims(&self, file: &Path, dims: Option<(usize, usize)>) -> Result<(), DataError> {
         let Some((o, a)) = dims else { return Ok(()) };
         let advice = "This is a file of another agent: choose the file, or the agent, that fits";

@@ -1,4 +1,4 @@
-//! From a file to [`Transitions`].
+//! Reads a file into [`Transitions`].
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -15,7 +15,7 @@ use super::robomimic::Robomimic;
 use super::rows;
 use crate::{DataError, Problem, Transitions};
 
-/// All layouts, in the order in which they are tried; the last one takes every file.
+/// All layouts, in the order in which they are tried. The last one accepts every file.
 const FORMATS: [&dyn Format; 3] = [&Minari, &Robomimic, &Flat];
 
 /// A validated data set.
@@ -23,29 +23,29 @@ const FORMATS: [&dyn Format; 3] = [&Minari, &Robomimic, &Flat];
 pub struct Loaded {
     /// The rows.
     pub transitions: Transitions,
-    /// The further columns that were asked for, each `[transitions.len()]`.
+    /// The requested further columns, each `[transitions.len()]`.
     pub columns: BTreeMap<String, Vec<f32>>,
-    /// What was read and what was left out.
+    /// Describes what was read and what was left out.
     pub report: LoadReport,
 }
 
 /// Reads and validates an HDF5 file of transitions; see [`files`](crate::files) for the layouts.
 ///
 /// # Errors
-/// A missing or unreadable file, one that is not HDF5, is cut off or damaged; a missing field, a wrong shape or type;
-/// fields that disagree; NaN or infinity; a file without (usable) rows.
+/// A missing or unreadable file, a file that is not HDF5, is truncated or damaged; a missing field, a wrong shape or
+/// type; fields that contradict each other; NaN or infinity; a file without (usable) rows.
 pub fn load(path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     let file = Hdf5::open(&main_file(path))?;
     let format = FORMATS.into_iter().find(|format| format.recognises(&file)).unwrap_or(&Flat);
     let mut raw = format.read(&file, options)?;
-    // After the last number is read.
+    // The notes are complete only after the last number is read.
     let mut warnings = file.notes();
     warnings.append(&mut raw.warnings);
     raw.warnings = warnings;
     finish(raw, path, options)
 }
 
-/// Rows as they were read, put right: `path` is what messages call them.
+/// Corrects and validates rows that were read. Messages call them `path`.
 pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loaded, DataError> {
     raw.check_dims(path, options.dims)?;
     let Raw { layout, columns: read, known, mut warnings } = raw;
@@ -63,11 +63,11 @@ pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loa
     };
     let summary = match layout {
         Layout::Otdf | Layout::D4rl => settle(&mut transitions, &mut columns, options.step_limit, &mut warnings),
-        // Somebody has changed a file of ours: it is looked at like any other.
+        // The file is ours, but someone has changed it: it is treated like any other.
         Layout::Tce if options.distrust_own && episodes::has_unmarked_ends(&table(&transitions, None)) => {
             settle(&mut transitions, &mut columns, options.step_limit, &mut warnings)
         }
-        // Their marks and successors are right by construction.
+        // In these layouts, marks and successors are right by construction.
         Layout::Tce | Layout::Minari | Layout::Robomimic => {
             let mut summary = Summary::plain();
             summary.dropped.last_row = drop_cut_ends(&mut transitions, &mut columns);
@@ -102,14 +102,14 @@ pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loa
     Ok(Loaded { transitions, columns, report })
 }
 
-/// Drops rows that are no terminals and whose successor is not known: the last ones of demonstrations. How many they were.
+/// Drops non-terminal rows whose successor is unknown (the last rows of demonstrations). Returns their number.
 fn drop_cut_ends(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>) -> usize {
     let keep: Vec<bool> = t.known.iter().zip(&t.terminals).map(|(known, terminal)| *known || *terminal).collect();
     retain(t, columns, &keep);
     keep.iter().filter(|&&k| !k).count()
 }
 
-/// Drops the rows that are not kept; the row before one that goes ends its episode.
+/// Drops all rows except `keep`. The row before a dropped one ends its episode.
 fn retain(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, keep: &[bool]) {
     if keep.iter().all(|&k| k) {
         return;
@@ -130,7 +130,7 @@ pub fn read_attributes(path: &Path) -> Result<BTreeMap<String, String>, DataErro
     Hdf5::open(&main_file(path))?.attributes()
 }
 
-/// What was decided about a whole file.
+/// Decisions about a whole file.
 struct Summary {
     environments: usize,
     ends: EpisodeEnds,
@@ -139,15 +139,15 @@ struct Summary {
 }
 
 impl Summary {
-    /// Of a file in which nothing had to be put right.
+    /// For a file in which nothing had to be corrected.
     fn plain() -> Self {
         let (ends, successors) = (EpisodeEnds::Marks, Successors::Stored);
         Self { environments: 1, ends, successors, dropped: Dropped::default() }
     }
 }
 
-/// Puts the rows in order, finds the ends of episodes and the successors, and drops what is of no use.
-/// `t.next_observations` and `t.timeouts` are empty where the file has none, and complete afterwards.
+/// Puts the rows in order, finds the ends of episodes and the successors, and drops unusable rows.
+/// `t.next_observations` and `t.timeouts` are empty if the file has none, and complete afterwards.
 fn settle(
     t: &mut Transitions,
     columns: &mut BTreeMap<String, Vec<f32>>,
@@ -163,11 +163,11 @@ fn settle(
              after the other"
         ));
         reorder(t, columns, &episodes::untangled(rows, environments));
-        // How far rows in order are apart is another thing.
+        // Once the rows are in order, the distances between them have changed.
         tolerance = episodes::tolerance(&table(t, limit));
     }
     let mut out = episodes::resolve(&table(t, limit), &tolerance, environments);
-    // What the file itself does not know stays so.
+    // Successors that the file marks as unknown stay unknown.
     out.known.iter_mut().zip(&t.known).for_each(|(known, said)| *known &= said);
     warnings.extend(out.warnings);
     if t.next_observations.is_empty() {

@@ -1,26 +1,26 @@
-//! What a file says of its rows, and what is made of it.
+//! The marks of a file's rows, and the decisions made from them.
 
 use super::report::{Dropped, EpisodeEnds, Successors};
 
-/// What a file says row by row, before anything is dropped.
+/// What a file says about each row, before any row is dropped.
 pub(super) struct Table<'a> {
     pub dim: usize,
     pub observations: &'a [f32],
-    /// Stored successors, if there are any.
+    /// Stored successors, if the file has them.
     pub next_observations: Option<&'a [f32]>,
     pub terminals: &'a [bool],
     pub timeouts: Option<&'a [bool]>,
-    /// Steps after which the collector cut an episode.
+    /// Number of steps after which the collector cut an episode.
     pub limit: Option<usize>,
 }
 
-/// What is made of it.
+/// The decisions made from a `Table`.
 #[derive(Debug, PartialEq)]
 pub(super) struct Resolved {
     pub timeouts: Vec<bool>,
-    /// Rows that stay.
+    /// Rows that are kept.
     pub keep: Vec<bool>,
-    /// Rows whose successor is known. The others are terminal.
+    /// Rows whose successor is known. The other rows are terminal.
     pub known: Vec<bool>,
     pub successors: Successors,
     pub ends: EpisodeEnds,

@@ -1,7 +1,8 @@
-//! Minari's layout (format `hdf5`, versions 0.4 and 0.5): a group `episode_N` an episode, with N + 1 `observations` for N `actions`,
-//! `rewards`, `terminations` and `truncations`. Spaces of kind Dict and Tuple are groups of arrays.
+//! Minari's layout (format `hdf5`, versions 0.4 and 0.5): one group `episode_N` per episode, with N + 1 `observations`
+//! for N `actions`, `rewards`, `terminations` and `truncations`. Spaces of kind Dict and Tuple are groups of arrays.
 //!
-//! A data set is a folder, `NAME/data/main_data.hdf5` beside `metadata.json`; the folder, its `data`, or the file may be given.
+//! A data set is a folder with `NAME/data/main_data.hdf5` and `metadata.json` beside it. The user may pass the folder,
+//! its `data` folder, or the file.
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +18,7 @@ pub(super) struct Minari;
 
 const MAIN_FILE: &str = "main_data.hdf5";
 
-/// The file of a data set that is given as a folder (Minari's); any other path as it is. [`load`](crate::load) takes both.
+/// The file of a data set given as a folder (Minari's); any other path unchanged. [`load`](crate::load) accepts both.
 pub fn main_file(path: &Path) -> PathBuf {
     let candidates = [path.join("data").join(MAIN_FILE), path.join(MAIN_FILE)];
     candidates.into_iter().find(|file| file.is_file()).unwrap_or_else(|| path.to_owned())
@@ -59,7 +60,7 @@ impl Format for Minari {
             all.next_observations.extend_from_slice(&states.data[d..]);
             all.actions.extend(actions.data);
             all.rewards.extend(rewards.data);
-            // An episode that the collector left without an end was cut.
+            // If the collector did not mark an end, the episode was cut at its last row.
             all.timeouts.extend((0..n).map(|i| !terminations[i] && (truncations[i] || i + 1 == n)));
             all.terminals.extend(terminations);
         }

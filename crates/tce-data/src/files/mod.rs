@@ -1,15 +1,16 @@
-//! HDF5 files of transitions: OTDF's and D4RL's layouts in, D4RL's layout out.
+//! HDF5 files of transitions: reads OTDF's and D4RL's layouts, writes D4RL's layout.
 //!
 //! | layout | recognised by | successors | episode boundaries |
 //! |---|---|---|---|
 //! | OTDF | `next_observations`, no `timeouts` | stored; wrong ones dropped | terminal, s'ᵢ ≠ sᵢ₊₁, step limit |
 //! | D4RL | everything else | stored if there (and right), else the next row, time-out rows dropped | `timeouts`, `terminals`, s'ᵢ ≠ sᵢ₊₁ |
 //!
-//! Whether s'ᵢ = sᵢ₊₁ is asked within a tolerance of each column's scale. Rows of several environments in turn are put in order. A
-//! terminal row without a successor stays, marked ([`Transitions::known`](crate::Transitions::known)).
+//! The test s'ᵢ = sᵢ₊₁ has a tolerance relative to each column's scale. Interleaved rows of several environments are
+//! put in order. A terminal row without a successor is kept and marked
+//! ([`Transitions::known`](crate::Transitions::known)).
 //!
-//! Nothing is used before the whole file has been validated, and no malformed file may panic or make the reader
-//! allocate far beyond the file's own size.
+//! The whole file is validated before any of it is used. No malformed file may cause a panic or make the reader
+//! allocate far more than the file's own size.
 
 mod columns;
 mod episodes;
@@ -38,9 +39,9 @@ pub use report::{Dropped, EpisodeEnds, Layout, LoadReport, Successors};
 pub use save::save_d4rl;
 pub use save_minari::save_minari;
 
-/// Root attribute of files written by [`save_d4rl`]: their `next_observations` are right by construction, and a
-/// time-out between two rows that do follow each other is meant.
+/// Root attribute of files written by [`save_d4rl`]. Their `next_observations` are right by construction, and a
+/// time-out between two rows that follow each other is intended.
 const FORMAT_ATTRIBUTE: &str = "tce_format";
 const FORMAT: &str = "transitions-1";
-/// Which successors are known, in files written by [`save_d4rl`]; only there where not all are.
+/// Which successors are known, in files written by [`save_d4rl`]; present only if some are unknown.
 const KNOWN: &str = "next_observations_known";

@@ -3,15 +3,15 @@
 /// What the caller knows about the file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LoadOptions {
-    /// Steps after which the collector cut an episode (`None`: never): 1000 for the benchmark's robots. Only looked at where the file has
-    /// no `timeouts`.
+    /// Number of steps after which the collector cut an episode (`None`: never): 1000 for the benchmark's robots. Used
+    /// only if the file has no `timeouts`.
     pub step_limit: Option<usize>,
     /// State and action dimension that the file must have, for example [`Agent::dims`](crate::Agent::dims).
     pub dims: Option<(usize, usize)>,
     /// Further columns to read, shape (N,) or (N, 1).
     pub columns: Vec<String>,
-    /// Read every further column that there is (D4RL's and OTDF's layouts); what cannot be read as one is told.
+    /// Read every further column (D4RL's and OTDF's layouts). A warning names those that cannot be read.
     pub all_columns: bool,
-    /// Look at files of ours, too: somebody may have changed them since.
+    /// Also examine files written by this program, in case someone has changed them.
     pub distrust_own: bool,
 }

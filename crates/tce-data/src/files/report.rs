@@ -1,17 +1,17 @@
-//! What was read, and what was left out.
+//! The report of what was read and what was left out.
 
 use std::fmt;
 use std::path::PathBuf;
 
 use serde::Serialize;
 
-/// Who wrote the file, told by its fields.
+/// The program that wrote the file, inferred from its fields.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layout {
     /// `next_observations`, no `timeouts`: the public target data.
     Otdf,
-    /// D4RL's fields; `next_observations` may be there.
+    /// D4RL's fields; `next_observations` is optional.
     D4rl,
     /// Written by [`save_d4rl`](crate::save_d4rl).
     Tce,
@@ -39,11 +39,11 @@ impl fmt::Display for Layout {
 pub enum Successors {
     /// From `next_observations`.
     Stored,
-    /// s'_i = s_{i+1}; the time-out rows, which have no such successor, are dropped (D4RL's `qlearning_dataset`).
+    /// s'_i = s_{i+1}. Time-out rows have no such successor and are dropped (D4RL's `qlearning_dataset`).
     NextRow,
 }
 
-/// What told where episodes end.
+/// The information that shows where episodes end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EpisodeEnds {
@@ -51,11 +51,11 @@ pub enum EpisodeEnds {
     Marks,
     /// Rows whose s' is not the next row's state, and `terminals`.
     Continuity,
-    /// `terminals` and a step limit, for want of anything else.
+    /// `terminals` and a step limit, because the file has nothing else.
     StepLimit(usize),
-    /// `terminals` alone, for want of anything else.
+    /// `terminals` alone, because the file has nothing else.
     Terminals,
-    /// Nothing: the rows are in no order, and each is an episode of its own.
+    /// No information: the rows are in no order, and each row is its own episode.
     NoOrder,
 }
 
@@ -71,7 +71,7 @@ impl fmt::Display for EpisodeEnds {
     }
 }
 
-/// Rows of the file that are not in the result, by reason.
+/// Numbers of rows in the file that are not in the result, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Dropped {
     /// The stored successor is the next episode's first state (OTDF's medium-expert files).
@@ -83,7 +83,7 @@ pub struct Dropped {
 }
 
 impl Dropped {
-    /// All of them.
+    /// The total number of dropped rows.
     pub fn total(&self) -> usize {
         self.wrong_successor + self.time_out + self.last_row
     }
@@ -94,24 +94,24 @@ impl Dropped {
 pub struct LoadReport {
     /// The file.
     pub file: PathBuf,
-    /// The layout found.
+    /// The layout that was detected.
     pub layout: Layout,
-    /// What was taken as s'.
+    /// The source of s'.
     pub successors: Successors,
-    /// What told where episodes end.
+    /// The information that showed where episodes end.
     pub episodes: EpisodeEnds,
-    /// Environments whose rows took turns; 1 where they did not.
+    /// Number of interleaved environments; 1 if the rows are not interleaved.
     pub environments: usize,
     /// Rows in the file.
     pub rows_in_file: usize,
-    /// Rows in the result: `rows_in_file` less all of `dropped`.
+    /// Rows in the result: `rows_in_file` minus the total of `dropped`.
     pub rows_kept: usize,
-    /// What is missing.
+    /// The rows that are missing from the result.
     pub dropped: Dropped,
-    /// Kept terminal rows whose s' the file does not hold. Harmless for values (nothing is bootstrapped there); models of the
-    /// dynamics leave them out.
+    /// Kept terminal rows whose s' is not in the file. Value functions do not need it (nothing is bootstrapped there);
+    /// dynamics models leave these rows out.
     pub unknown_successors: usize,
-    /// What the user should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 

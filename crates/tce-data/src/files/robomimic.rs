@@ -1,8 +1,8 @@
-//! robomimic's layout: a group `data` with a group `demo_N` a demonstration, each with `obs` and `next_obs` (groups of arrays),
-//! `actions`, `rewards` and `dones`.
+//! robomimic's layout: a group `data` with one group `demo_N` per demonstration. Each has `obs` and `next_obs` (groups
+//! of arrays), `actions`, `rewards` and `dones`.
 //!
-//! `dones` are terminals, as robomimic's own algorithms take them. A demonstration without a `done` at its end was cut there. Without
-//! `next_obs`, s' is the next row's state, and the last row of a demonstration has none.
+//! `dones` are terminals, as in robomimic's own algorithms. A demonstration without a `done` at its end was cut there.
+//! Without `next_obs`, s' is the next row's state, and the last row of a demonstration has none.
 
 use super::episodes_in_groups::{Together, field, numbered, unless_empty};
 use super::formats::{Format, Raw};

@@ -1,6 +1,6 @@
-//! Rows by their numbers.
+//! Helpers for rows, addressed by index.
 
-/// In words: `row 3`, `rows 3, 7 and 11`, `rows 99, 199, 299 and 16 more`.
+/// Lists rows in words: `row 3`, `rows 3, 7 and 11`, `rows 99, 199, 299 and 16 more`.
 pub(super) fn tell(rows: &[usize]) -> String {
     match rows {
         [] => "no row".into(),
@@ -13,7 +13,7 @@ pub(super) fn tell(rows: &[usize]) -> String {
     }
 }
 
-/// Marks the row before a dropped one as the end of its episode.
+/// Marks the row before each dropped row as the end of its episode.
 pub(super) fn cut_before_dropped(keep: &[bool], terminals: &[bool], timeouts: &mut [bool]) {
     for i in 1..keep.len() {
         if !keep[i] && keep[i - 1] && !terminals[i - 1] {
@@ -22,7 +22,7 @@ pub(super) fn cut_before_dropped(keep: &[bool], terminals: &[bool], timeouts: &m
     }
 }
 
-/// Removes the rows that are not kept.
+/// Removes all rows except those in `keep`.
 pub(super) fn retain<T: Copy>(data: &mut Vec<T>, dim: usize, keep: &[bool]) {
     let mut to = 0;
     for (i, _) in keep.iter().enumerate().filter(|(_, k)| **k) {
@@ -32,7 +32,7 @@ pub(super) fn retain<T: Copy>(data: &mut Vec<T>, dim: usize, keep: &[bool]) {
     data.truncate(to);
 }
 
-/// The rows in another order.
+/// Returns the rows in the given order.
 pub(super) fn reordered<T: Copy>(data: &[T], dim: usize, order: &[usize]) -> Vec<T> {
     order.iter().flat_map(|&i| data[i * dim..(i + 1) * dim].iter().copied()).collect()
 }

@@ -1,4 +1,4 @@
-//! From [`Transitions`] to a file that D4RL's loaders and h5py read.
+//! Writes [`Transitions`] to a file that D4RL's loaders and h5py read.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -10,18 +10,19 @@ use tce_base::{AtomicFile, FileError};
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem, Transitions};
 
-/// Bytes per chunk before compression: large enough to compress well, small enough to inflate a few at a time.
+/// Bytes per chunk before compression: large enough to compress well, small enough to decompress a few at a time.
 const CHUNK_BYTES: usize = 512 * 1024;
-/// Longest side of a chunk, in elements. `hdf5-pure` writes a side of 65,536 and more with four bytes, where three would
-/// do; HDF5 2.0 recomputes the width and refuses every other ("stored chunk dimension encoding length"). Sides of up to
-/// 255 and up to 65,535 have one width in both.
+/// Longest side of a chunk, in elements. `hdf5-pure` writes a side of 65,536 or more with four bytes, where three are
+/// enough. HDF5 2.0 recomputes the width and rejects any other ("stored chunk dimension encoding length"). For sides of
+/// up to 255 and of up to 65,535, both use the same width.
 const MAX_CHUNK_SIDE: usize = 65_535;
-/// Float32 noise hardly compresses; higher levels cost time and save nothing.
+/// Float32 noise hardly compresses. Higher levels cost time and save no space.
 const DEFLATE_LEVEL: u32 = 4;
 
-/// Writes `data` in D4RL's layout with `next_observations`: `observations`, `actions`, `next_observations` (f32, (N, D)),
-/// `rewards` (f32, (N,)), `terminals`, `timeouts` (h5py booleans, (N,)), gzip and shuffle; `attributes` on the root;
-/// `columns` (f32, (N,)) beside the others, those named `GROUP/NAME` in a group. The file is complete or absent.
+/// Writes `data` in D4RL's layout with `next_observations`: `observations`, `actions`, `next_observations` (f32, (N,
+/// D)), `rewards` (f32, (N,)), `terminals`, `timeouts` (h5py booleans, (N,)), compressed with gzip and shuffle.
+/// `attributes` are written to the root, `columns` (f32, (N,)) beside the other fields; a column named `GROUP/NAME` is
+/// written into a group. The file is complete or absent.
 ///
 /// # Errors
 /// No rows, columns of other lengths, a column with a reserved name, a full disk.
@@ -85,7 +86,7 @@ pub(super) fn boolean() -> Datatype {
     values.build().expect("a constant type")
 }
 
-/// Writes what was built into `file`; `path` is for messages.
+/// Writes the content of `builder` to `file`; `path` is for messages.
 pub(super) fn finish(builder: FileBuilder, file: &mut File, path: &Path) -> Result<(), FileError> {
     builder.finish_to(file).map_err(|e| {
         let source = match e {

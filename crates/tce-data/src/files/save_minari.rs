@@ -1,4 +1,4 @@
-//! From [`Transitions`] to a folder that `minari.load_dataset` reads.
+//! Writes [`Transitions`] to a folder that `minari.load_dataset` reads.
 
 use std::path::Path;
 
@@ -8,17 +8,18 @@ use tce_base::{AtomicFile, AtomicFolder, write_json};
 use super::save::{boolean, finish};
 use crate::{ActionRange, DataError, Problem, Transitions};
 
-/// Read by Minari 0.5.
+/// Minari 0.5 reads this version.
 const VERSION: &str = "0.5.0";
 
-/// Writes `data` as the Minari data set `id` (`robot/task-v0`) into the folder `path`: `data/main_data.hdf5` and `data/metadata.json`.
-/// Minari finds it where `path` is its `MINARI_DATASETS_PATH` followed by `id`. Every episode is a group; an episode without order, such
-/// as a generated row, is one of a single step. `range` is that of the action space; None: [-1, 1].
+/// Writes `data` as the Minari data set `id` (`robot/task-v0`) into the folder `path`: `data/main_data.hdf5` and
+/// `data/metadata.json`. Minari finds it if `path` is its `MINARI_DATASETS_PATH` followed by `id`. Every episode is a
+/// group. Rows without order, such as generated rows, become episodes of a single step. `range` is the range of the
+/// action space; `None`: [-1, 1].
 ///
-/// The folder is complete or absent; nothing that is there is replaced.
+/// The folder is complete or absent; existing files are never replaced.
 ///
 /// # Errors
-/// No rows; an episode whose rows do not follow each other; a folder that is there; a full disk.
+/// No rows; an episode whose rows do not follow each other; an existing folder; a full disk.
 pub fn save_minari(path: &Path, id: &str, data: &Transitions, range: Option<&ActionRange>) -> Result<(), DataError> {
     let refuse = |found: String, expected: &str| {
         let advice = "Nothing was written; choose another name, or remove what is there";
@@ -84,7 +85,7 @@ fn words(values: &[f32]) -> Vec<String> {
     values.iter().map(|v| format!("{v:?}")).collect()
 }
 
-/// A Box of float32, as Minari's `serialize_space` writes it: JSON with Python's `Infinity`.
+/// A Box of float32 in the form of Minari's `serialize_space`: JSON with Python's `Infinity`.
 fn space(low: &[impl AsRef<str>], high: &[impl AsRef<str>]) -> String {
     let list = |v: &[&str]| v.join(", ");
     let (n, low): (usize, Vec<&str>) = (low.len(), low.iter().map(AsRef::as_ref).collect());

@@ -1,9 +1,9 @@
-//! How far a state is from the next one: what tells where episodes end in files that hold no successors, or none that tell anything.
+//! Distances between consecutive states: they show where episodes end if stored successors are absent or uninformative.
 
 use super::marks::{Resolved, Table};
 use super::rows::tell;
 
-/// The steps from row to row, in units of the columns' spreads.
+/// The steps between consecutive rows, in units of the columns' spreads.
 pub(super) struct Steps<'a> {
     table: &'a Table<'a>,
     lengths: Vec<f32>,
@@ -17,19 +17,19 @@ impl<'a> Steps<'a> {
         Self { table, lengths, median }
     }
 
-    /// Whether the state jumps after these rows, as it does where another episode begins. On the public sets such steps are 1.8 to 56 times
-    /// the usual one.
+    /// Whether the state jumps after these rows, as it does where a new episode begins. On the public sets such steps
+    /// are 1.8 to 56 times the usual one.
     pub fn jump_at(&self, rows: &[usize]) -> bool {
-        // One or two ends may be long steps by chance.
+        // With one or two ends, the steps may be long by chance.
         let jump = if rows.len() < 3 { 3.0 * JUMP } else { JUMP };
         median(rows.iter().map(|&i| self.lengths[i])) > jump * self.median
     }
 
-    /// Whether a row is much closer to the next one than to any other. (At HalfCheetah's pace it is not.)
+    /// Whether a row is much closer to the next one than to any other. (Not true at HalfCheetah's pace.)
     pub fn in_order(&self) -> bool {
         let d = self.table.dim;
         let n = self.table.terminals.len();
-        // A stride that hits no short period.
+        // A stride that is not close to a multiple of a short period.
         let far = (n as f64 * 0.381_966) as usize;
         let rows: Vec<f32> =
             (0..n).flat_map(|i| self.table.observations[((i + i * far) % n) * d..][..d].iter().copied()).collect();
@@ -38,10 +38,10 @@ impl<'a> Steps<'a> {
     }
 }
 
-/// By how much a step into another episode is longer than the usual one, in the middle.
+/// Smallest ratio of the median step into another episode to the usual step.
 const JUMP: f32 = 1.4;
 
-/// `timeouts` of a file without successors, one row earlier or later where the states jump there and not at the marks.
+/// Returns `timeouts` of a file without successors, shifted by some rows if the states jump there and not at the marks.
 pub(super) fn in_place(table: &Table<'_>, timeouts: &[bool], warnings: &mut Vec<String>) -> Vec<bool> {
     let n = timeouts.len();
     let reach = FURTHEST as usize;
@@ -66,10 +66,10 @@ pub(super) fn in_place(table: &Table<'_>, timeouts: &[bool], warnings: &mut Vec<
     (0..n).map(|i| i.checked_add_signed(-shift).and_then(|j| timeouts.get(j)).copied().unwrap_or(false)).collect()
 }
 
-/// Marks are looked for up to this many rows from where the states jump.
+/// Largest shift, in rows, that is tried between the marks and the jumps of the state.
 const FURTHEST: isize = 5;
 
-/// Told of a file without successors: rows after which the state jumps, and no episode ends; rows of several environments in turn.
+/// Warnings for a file without successors: jumps of the state where no episode ends; interleaved environments.
 pub(super) fn doubts(table: &Table<'_>, out: &Resolved) -> Vec<String> {
     let steps = Steps::new(table);
     let ended = |i: usize| table.terminals[i] || out.timeouts[i];
@@ -93,7 +93,7 @@ pub(super) fn doubts(table: &Table<'_>, out: &Resolved) -> Vec<String> {
     };
     if n > 1000 && !steps.in_order() {
         let near = apart(1);
-        // In squares: a third of the distance.
+        // These are squared distances: the ratio .1 is about a third of the distance.
         if let Some(k) = (2..=64).find(|&lag| apart(lag) < 0.1 * near) {
             told.push(format!(
                 "states {k} rows apart are much closer than neighbours: do the rows of {k} environments take turns? Then every s' is another \
@@ -104,8 +104,8 @@ pub(super) fn doubts(table: &Table<'_>, out: &Resolved) -> Vec<String> {
     told
 }
 
-/// Rows that do not end an episode and after which the state jumps: by more than 8 usual steps and 5 times what 95 % of the steps are, at
-/// least three of them. The contacts of walking robots stay below that.
+/// Rows that do not end an episode and after which the state jumps: by more than 8 usual steps and 5 times the 95 %
+/// quantile of the steps, at least three such rows. The contacts of walking robots stay below that.
 fn jumps(lengths: &[f32], ended: &dyn Fn(usize) -> bool) -> Vec<usize> {
     let mut usual: Vec<f32> = (0..lengths.len()).filter(|&i| !ended(i)).map(|i| lengths[i]).collect();
     if usual.len() < 100 {

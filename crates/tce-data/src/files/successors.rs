@@ -1,8 +1,8 @@
-//! Stored successors that are not finite, and what a table with or without successors and time-outs is.
+//! Stored successors that are not finite, and the layout of a table given which fields it has.
 
 use super::report::Layout;
 
-/// The layout of a table that nobody vouches for.
+/// The layout of a table whose successors and marks are not guaranteed to be right.
 pub(super) fn layout_of(successors: bool, timeouts: bool) -> Layout {
     match (successors, timeouts) {
         (true, false) => Layout::Otdf,
@@ -10,11 +10,11 @@ pub(super) fn layout_of(successors: bool, timeouts: bool) -> Layout {
     }
 }
 
-/// Puts the state in the place of successors that are not finite, which only terminal rows may have, and marks them as not `known`. How
-/// many there were.
+/// Replaces successors that are not finite by the state and marks them as not `known`. Only terminal rows may have such
+/// successors. Returns their number.
 ///
 /// # Errors
-/// The first such row that is no terminal.
+/// The first such row that is not terminal.
 pub(super) fn fill_gaps(
     next: &mut [f32],
     observations: &[f32],
@@ -37,7 +37,7 @@ pub(super) fn fill_gaps(
     Ok(gaps.len())
 }
 
-/// What the user is told of them.
+/// The warning about these successors.
 pub(super) fn told_gaps(name: &str, gaps: usize) -> Option<String> {
     (gaps > 0)
         .then(|| format!("`{name}` is not finite in {gaps} terminal rows, whose next state is taken as not known"))

@@ -57,7 +57,7 @@ fn rows_come_to_respect_it() {
     assert_eq!(row[5..9], [0.0; 4]);
 }
 
-/// A rare clip counts if another column shows the bound; a bound of its own does not.
+/// A rare clip counts if another column has the same bound; with a bound of its own it does not count.
 #[test]
 fn one_sensor_clips_all_its_columns_at_the_same_bound() {
     let mut rng = Streams::new(3).stream("rows");
@@ -73,7 +73,7 @@ fn one_sensor_clips_all_its_columns_at_the_same_bound() {
     assert_eq!((s.clips[1].column, s.clips[1].low, s.clips[1].high), (1, None, Some(Bound { value: 10.0, rows: 1 })));
 }
 
-/// 20 of 5000 rows of one table are an atom, however many rows the other table has.
+/// 20 of 5000 rows of one table are an atom, whatever the number of rows of the other table.
 #[test]
 fn a_large_table_does_not_hide_an_atom_of_a_small_one() {
     let mut rng = Streams::new(4).stream("rows");
@@ -82,14 +82,14 @@ fn a_large_table_does_not_hide_an_atom_of_a_small_one() {
     let large: Vec<f32> = (0..100_000).map(|_| rng.random_range(-1.0..0.9)).collect();
     let s = Support::fit(&[&large, &small], 1);
     assert_eq!(s.clips, [Clip { column: 0, low: None, high: Some(Bound { value: 1.0, rows: 20 }) }]);
-    // Beyond the atom of one table there are values of the other: no bound.
+    // The other table has values beyond the atom of this one, so it is not a bound.
     let wide: Vec<f32> = large.iter().map(|x| 2.0 * x).collect();
     assert!(Support::fit(&[&wide, &small], 1).is_empty());
 }
 
 #[test]
 fn steps_counters_and_steady_columns_are_not_mistaken() {
-    // Columns: a counter of steps in episodes of 20; about 1 and about 0 (their norm is 1 by chance); a coarse sensor.
+    // Columns: a step counter in episodes of 20; values near 1 and near 0 (their norm is 1 by chance); a coarse sensor.
     let mut rng = Streams::new(5).stream("rows");
     let rows: Vec<f32> = (0..5000)
         .flat_map(|i| {
@@ -98,7 +98,7 @@ fn steps_counters_and_steady_columns_are_not_mistaken() {
         })
         .collect();
     assert!(Support::fit(&[&rows], 4).is_empty());
-    // A circle beside a joint that hardly moves is no quaternion; one-hot flags are no circle.
+    // A circle beside a joint that hardly moves is not a quaternion; one-hot flags are not a circle.
     let rows: Vec<f32> = (0..5000)
         .flat_map(|i| {
             let mut u = || rng.random_range(-1.0f32..1.0);
@@ -138,7 +138,7 @@ fn bits(rows: &[f32]) -> Vec<u32> {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
-    /// Twice is as good as once, other columns keep their bytes, and bounds hold, for any numbers.
+    /// For any numbers: a second application changes nothing, other columns keep their bytes, and bounds hold.
     #[test]
     fn applying_is_idempotent_and_touches_nothing_else(
         rows in prop::collection::vec(prop_oneof![-30f32..30.0, any::<f32>(), Just(-0.0f32), Just(10.0f32)], DIM * 20),
@@ -160,7 +160,7 @@ proptest! {
         }
     }
 
-    /// The data's own rows are left as they are, and continuous columns of any scale are found to be nothing.
+    /// The data's own rows do not change, and continuous columns of any scale give no finding.
     #[test]
     fn own_rows_stay_and_continuous_columns_are_free(seed in 0u64..1000, rows in 1000usize..3000) {
         let own = table(seed, rows);

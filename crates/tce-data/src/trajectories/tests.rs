@@ -11,7 +11,7 @@ enum End {
     Limit,
 }
 
-/// Trajectories of (rows, reward per step, end); rewards rise over the first 50 rows, and differ a little by row.
+/// Trajectories of (rows, reward per step, end). Rewards rise over the first 50 rows and vary a little from row to row.
 fn data(trajectories: &[(usize, f32, End)], seed: u64) -> Transitions {
     let mut rng = Streams::new(seed).stream("rewards");
     let mut t = Transitions::new(1, 1);
@@ -47,12 +47,12 @@ fn the_better_of_two_qualities_is_chosen_and_told() {
     assert!(!choose_trajectories_with(&t, f64::INFINITY).is_selective());
 }
 
-/// Paid for not falling, at the same pace: only the return tells, and one early fall is an accident.
+/// Reward for not falling, always the same pace: only the return separates, and one early fall is an accident.
 #[test]
 fn falls_tell_where_the_pace_does_not() {
     let t = data(&[(410, 1.0, Fall), (400, 1.0, Fall), (1000, 1.0, Limit), (1000, 1.0, Limit), (300, 1.0, Limit)], 2);
     let c = choose_trajectories(&t);
-    // The last one was cut before anything could be told: kept.
+    // The last one was cut too early to be judged, so it is kept.
     assert_eq!(kept(&c, &t)[..2], [2, 3]);
     assert!(matches!(c.threshold, Some((Measure::Return, _))), "{}", c.reason);
     let t = data(&[(400, 1.0, Fall), (1000, 1.0, Limit), (1000, 1.01, Limit), (1000, 0.99, Limit)], 3);
@@ -87,9 +87,9 @@ fn one_quality_is_kept_whole() {
         vec![(1000, 1.0, Limit); 5],
         // Falls at any time.
         vec![(300, 3.0, Fall), (460, 3.3, Fall), (700, 3.2, Fall), (1000, 2.9, Limit), (200, 3.0, Limit)],
-        // Costs, hardly different.
+        // Costs that hardly differ.
         vec![(1000, -1.0, Limit), (1000, -1.05, Limit), (1000, -1.1, Limit)],
-        // A slope of qualities, as in a replay buffer.
+        // Continuously rising quality, as in a replay buffer.
         (1..40).map(|i| (1000, i as f32, Limit)).collect(),
     ] {
         let t = data(&trajectories, 5);
@@ -117,7 +117,7 @@ fn too_few_good_rows_are_not_learned_from_alone() {
     assert_eq!(c.rows.len(), 1000);
 }
 
-/// A thousand episodes with some outliers in both groups: the outer tenth does not hide the gap.
+/// A thousand episodes with some outliers in both groups: without the outer tenth, the gap is still found.
 #[test]
 fn outliers_do_not_hide_two_qualities_of_many() {
     let mut trajectories = Vec::new();
@@ -132,7 +132,8 @@ fn outliers_do_not_hide_two_qualities_of_many() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
-    /// Two clear qualities, in any order and any unit of reward: exactly the better ones, whole and in order.
+    /// Two clear qualities, in any order and any unit of reward: exactly the better ones are chosen, whole and in
+    /// order.
     #[test]
     fn two_clear_qualities_in_any_order(
         qualities in prop::collection::vec(any::<bool>(), 2..8), unit in prop_oneof![Just(1f32), Just(1e-3), Just(1e4)], seed in 0u64..100,
@@ -147,7 +148,7 @@ proptest! {
         prop_assert_eq!(rows, c.rows);
     }
 
-    /// Whatever the rewards: the best whole trajectory is kept, rows are whole trajectories, the reason is a sentence.
+    /// For any rewards: the best whole trajectory is kept, rows form whole trajectories, the reason is a sentence.
     #[test]
     fn the_best_is_always_kept(
         trajectories in prop::collection::vec((1usize..400, -3f32..3.0, any::<bool>()), 1..10), seed in 0u64..100,

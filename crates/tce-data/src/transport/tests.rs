@@ -1,10 +1,10 @@
-//! Against closed forms, the definition in f64, and the best assignment.
+//! Tests against closed forms, the definition in f64, and the best assignment.
 
 use super::*;
 use rand::RngExt;
 use tce_base::Streams;
 
-/// The module's formulas, written down directly in f64: (P, C).
+/// The formulas of the module, written directly in f64: (P, C).
 fn oracle(
     x: &[f32],
     y: &[f32],
@@ -52,8 +52,8 @@ fn costs(x: &[f32], y: &[f32], dim: usize, options: &TransportOptions) -> Vec<f3
     transport_costs(&Rows::new(x, dim), &Rows::new(y, dim), options).unwrap()
 }
 
-/// Two sources at angles 0 and 90 degrees, two targets likewise: C = [[0, 1], [1, 0]], mean 1/2. By symmetry
-/// P = [[p, q], [q, p]] with q/p = exp(-1/ε), p + q = 1/2; every row costs q.
+/// Two sources at angles 0 and 90 degrees, two targets likewise: C = [[0, 1], [1, 0]], mean 1/2. By symmetry P = [[p,
+/// q], [q, p]] with q/p = exp(-1/ε), p + q = 1/2, so every row costs q.
 #[test]
 fn the_two_by_two_case_in_closed_form() {
     let axes = [1.0, 0.0, 0.0, 3.0];
@@ -75,7 +75,7 @@ fn it_follows_the_definition_iteration_by_iteration() {
     }
 }
 
-/// Tiny ε: the scalings leave the range of the kernel, and the transport becomes the best assignment.
+/// With a tiny ε, the scalings leave the range of the kernel, and the transport becomes the best assignment.
 #[test]
 fn without_entropy_it_is_the_best_assignment() {
     for seed in 0..5 {
@@ -103,7 +103,7 @@ fn permutations(p: &mut [usize; 5], k: usize, visit: &mut impl FnMut(&[usize; 5]
     }
 }
 
-/// The row marginals hold after every iteration: with `per_row`, a cost is a weighted mean of the row's C.
+/// The row marginals hold after every iteration. With `per_row`, a cost is therefore a weighted mean of the row's C.
 #[test]
 fn both_marginals_hold() {
     let (x, y) = (points(3, 500, 5, 0.1), points(4, 120, 5, 0.1));
@@ -141,7 +141,7 @@ fn blocks_are_independent_and_per_row_undoes_their_size() {
 #[test]
 fn one_thread_gives_the_same_bytes_and_extreme_rows_stay_finite() {
     let (mut x, y) = (points(7, 700, 6, 2.0), points(8, 80, 6, 2.0));
-    // A mass of nearly parallel rows makes ε tiny; one opposite row and a zero row are far from everything.
+    // Many nearly parallel rows make ε tiny; one opposite row and a zero row are far from all others.
     x[..6].fill(-5.0);
     x[6..12].fill(0.0);
     let run = || costs(&x, &y, 6, &TransportOptions::default());

@@ -1,4 +1,4 @@
-//! Where episodes end, and which successors are known, in files of people's own.
+//! Tests of ends of episodes and known successors in users' own files.
 
 use std::ops::Range;
 
@@ -13,7 +13,7 @@ const EPISODES: usize = 20;
 const LENGTH: usize = 100;
 const ROWS: usize = EPISODES * LENGTH;
 
-/// Twenty random walks of a hundred steps in three dimensions, and a file of them in the making.
+/// Twenty random walks of a hundred steps in three dimensions, and the fields of a file with them.
 #[derive(Clone)]
 struct Walks {
     observations: Vec<f32>,
@@ -49,7 +49,7 @@ impl Walks {
         let mut b = FileBuilder::new();
         b.create_dataset("observations").with_f32_data(&self.observations).with_shape(&[n, 3]);
         b.create_dataset("actions").with_f32_data(&vec![0.5; 2 * n as usize]).with_shape(&[n, 2]);
-        // The row's own number, to know it again.
+        // The row's own number, to identify it later.
         b.create_dataset("rewards").with_f32_data(&(0..n).map(|i| i as f32).collect::<Vec<_>>());
         enum_flags(&mut b, "terminals", &self.terminals);
         if let Some(next) = &self.next {
@@ -116,7 +116,7 @@ fn shifted_marks_lose_against_right_successors() {
     }
 }
 
-/// Right marks, and successors that were built as the next row: at the ends nobody knows them.
+/// The marks are right, and successors were built from the next row: at the ends they are unknown.
 #[test]
 fn rebuilt_successors_are_still_told_from_shifted_marks() {
     let mut walks = Walks::new();
@@ -131,7 +131,7 @@ fn rebuilt_successors_are_still_told_from_shifted_marks() {
     assert_eq!(got.transitions.episodes().len(), 20);
 }
 
-/// The same successors under marks that are in other rows: where the states jump tells.
+/// The same successors with misplaced marks: the jumps of the state show the ends.
 #[test]
 fn rebuilt_successors_under_wrong_marks_are_found_by_the_jumps() {
     let mut next = Walks::new().observations[3..].to_vec();
@@ -148,7 +148,7 @@ fn rebuilt_successors_under_wrong_marks_are_found_by_the_jumps() {
     }
 }
 
-/// One walk without a reset: whatever is marked, s' = next s proves nothing.
+/// One walk without a reset: with any marks, s' = next s proves nothing.
 #[test]
 fn right_successors_of_one_stream_are_never_thrown_away() {
     let stream = Walks::of(1, ROWS);
@@ -186,7 +186,7 @@ fn a_few_late_marks_are_moved() {
     assert!(got.report.to_string().contains("`timeouts` marks rows 100, 200, 300 and 400"), "{}", got.report);
 }
 
-/// Successors that are nowhere the next row's state: some steps later, or with a column of their own. The marks are right.
+/// The successors are never the next row's state: some steps later, or with one other column. The marks are right.
 #[test]
 fn successors_stored_in_another_way_leave_the_marks_alone() {
     let mut walks = Walks::new();
@@ -219,7 +219,7 @@ fn without_successors_wrong_marks_show_in_the_jumps() {
         assert!(got.report.to_string().contains("the state jumps after rows"), "{}", got.report);
     }
     assert!(!straight.read().report.to_string().contains("jumps"), "{}", straight.read().report);
-    // Four environments in turn: nothing can be put right, and the user is told.
+    // Four interleaved environments: this cannot be corrected, so the user is warned.
     let order: Vec<usize> = (0..ROWS / 4).flat_map(|i| (0..4).map(move |k| k * ROWS / 4 + i)).collect();
     let got = straight.permuted(&order).read();
     assert!(got.report.to_string().contains("do the rows of 4 environments take turns?"), "{}", got.report);
@@ -255,7 +255,7 @@ fn rounded_successors_do_not_end_episodes() {
 #[test]
 fn environments_that_take_turns_are_put_in_order() {
     for (environments, marked) in [(4, true), (4, false), (20, true), (3, true)] {
-        // Row i of environment k stands at i * environments + k.
+        // Row i of environment k is at index i * environments + k.
         let straight = Walks::of(environments, 5 * LENGTH);
         let order: Vec<usize> =
             (0..5 * LENGTH).flat_map(|i| (0..environments).map(move |k| k * 5 * LENGTH + i)).collect();
@@ -267,7 +267,7 @@ fn environments_that_take_turns_are_put_in_order() {
         assert_eq!(got.report.environments, environments);
         assert_eq!(spans(&got.transitions), spans(&straight.read().transitions), "{environments}, marks: {marked}");
         assert_eq!(got.transitions.observations, straight.observations);
-        // The other columns go along.
+        // The other columns are reordered in the same way.
         let expected: Vec<f32> = (0..environments * 5 * LENGTH)
             .map(|row| ((row % (5 * LENGTH)) * environments + row / (5 * LENGTH)) as f32)
             .collect();
@@ -314,14 +314,14 @@ fn a_terminal_row_without_a_successor_is_learned_from_and_its_dynamics_are_not()
     assert_eq!(terminal.iter().map(|&i| t.rewards[i]).collect::<Vec<_>>(), [499.0, ROWS as f32 - 1.0]);
     assert!(terminal.iter().all(|&i| !t.known[i] && t.observation(i) == t.next_observation(i)));
     assert_eq!((got.report.unknown_successors, t.with_successors().len()), (2, t.len() - 2));
-    // What is written and read again is the same.
+    // A file that is written and read again gives the same rows.
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("again.hdf5");
     save_d4rl(&path, t, &Default::default(), &[]).unwrap();
     assert_eq!(tce_data::load(&path, &LoadOptions::default()).unwrap().transitions, *t);
 }
 
-/// Some loggers write NaN where an episode ended for good.
+/// Some loggers write NaN where an episode ended at a terminal.
 #[test]
 fn a_successor_that_is_no_number_is_not_known_where_it_is_not_needed() {
     let mut walks = Walks::new();
@@ -364,7 +364,7 @@ fn shifted_terminals_are_told_and_used_as_they_are() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
 
-    /// Whatever is marked: with right successors, no row is lost, none gets another successor, and no episode runs over a break.
+    /// With right successors and any marks: no row is lost or gets another successor, no episode crosses a break.
     #[test]
     fn right_successors_survive_any_marks(seed in 0u64..1000, share in 0.0f64..0.3, terminals in any::<bool>()) {
         let mut rng = Streams::new(seed).stream("marks");

@@ -1,4 +1,4 @@
-//! Good files of every kind, and what is made of them.
+//! Tests of reading valid files of every kind.
 
 use std::collections::BTreeMap;
 
@@ -28,8 +28,8 @@ fn otdf_uses_stored_successors_and_finds_the_boundaries() {
     assert_eq!((ends(&t.terminals), ends(&t.timeouts)), (vec![299], vec![1299, 1799, 2499]));
 }
 
-/// A stream of 1500 rows and then a real limit-ended episode cannot be told apart from rebuilt successors: the step
-/// limit is the caller's knowledge.
+/// A stream of 1500 rows and then a real limit-ended episode cannot be distinguished from rebuilt successors: only the
+/// caller knows the step limit.
 #[test]
 fn the_step_limit_is_an_option() {
     let dir = tempfile::tempdir().unwrap();
@@ -44,7 +44,7 @@ fn the_step_limit_is_an_option() {
 #[test]
 fn rebuilt_successors_are_dropped_and_their_episodes_stay_cut() {
     let dir = tempfile::tempdir().unwrap();
-    // Two episodes of 1000 steps, one terminal after 500; successors built as the next row everywhere.
+    // Two episodes of 1000 steps, one terminal after 500; successors are built from the next row everywhere.
     let mut r = rebuilt(&[1000, 1000, 500, 100]);
     r.terminals[2499] = true;
     let got = load(&write(&dir, "a.hdf5", r.otdf())).unwrap();
@@ -52,14 +52,14 @@ fn rebuilt_successors_are_dropped_and_their_episodes_stay_cut() {
     let t = &got.transitions;
     assert_eq!(starts_and_ends(t), [(0, 999), (999, 1998), (1998, 2498), (2498, 2598)]);
     assert!(t.timeouts[998] && t.timeouts[1997]);
-    // The terminal row stays for whoever learns from its reward; its successor is not known.
+    // The terminal row is kept for methods that learn from its reward; its successor is unknown.
     assert!(t.terminals[2497] && !t.known[2497] && t.next_observation(2497) == t.observation(2497));
     assert_eq!((got.report.unknown_successors, t.with_successors().len()), (1, 2597));
     let text = got.report.to_string();
     assert!(text.contains("2598 of 2600 rows; dropped 2 for a wrong stored successor"), "{text}");
 }
 
-/// What `d4rl.qlearning_dataset` returns for this file, row by row.
+/// Compares with the result of `d4rl.qlearning_dataset` for this file, row by row.
 #[test]
 fn d4rl_without_successors_follows_qlearning_dataset() {
     let dir = tempfile::tempdir().unwrap();
@@ -74,7 +74,7 @@ fn d4rl_without_successors_follows_qlearning_dataset() {
     let first: Vec<f32> = (0..t.len()).map(|i| t.observation(i)[0]).collect();
     let next: Vec<f32> = (0..t.len()).map(|i| t.next_observation(i)[0]).collect();
     assert_eq!(first, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 8.0]);
-    // `qlearning_dataset` has 4, the next episode's first state, as successor of the terminal row 3.
+    // In `qlearning_dataset`, the terminal row 3 has successor 4, the next episode's first state.
     assert_eq!(next, [1.0, 2.0, 3.0, 3.0, 5.0, 6.0, 8.0, 9.0]);
     assert_eq!((0..8).filter(|&i| !t.known[i]).collect::<Vec<_>>(), [3]);
     assert_eq!(starts_and_ends(t), [(0, 4), (4, 6), (6, 8)]);
@@ -122,7 +122,7 @@ fn without_timeouts_and_successors_steps_are_counted() {
     assert!(got.report.warnings[0].contains("1000 steps"));
 }
 
-/// f64 states, terminals as f64, i32, u8 and booleans, (N,) and (N, 1): the same rows come out.
+/// f64 states, terminals as f64, i32, u8 and booleans, (N,) and (N, 1): all give the same rows.
 #[test]
 fn every_storage_type_gives_the_same_rows() {
     let dir = tempfile::tempdir().unwrap();
@@ -179,7 +179,7 @@ fn own_files_come_back_exactly_with_attributes_and_columns() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("deep/out.hdf5");
     let mut t = crate::common::synthetic(5000, 17, 6, 37);
-    // A stream cut on purpose: s' is the next row's state across a time-out. Nobody may "repair" this.
+    // A stream that is cut on purpose: s' is the next row's state across a time-out. The reader must not "repair" this.
     for i in (36..4999).step_by(37) {
         let next = t.observation(i + 1).to_vec();
         t.next_observations[i * 17..(i + 1) * 17].copy_from_slice(&next);

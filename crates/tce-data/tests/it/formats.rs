@@ -1,4 +1,5 @@
-//! Minari's and robomimic's layouts: files that `minari` itself wrote, files that it reads, and every fault by name.
+//! Tests of Minari's and robomimic's layouts: files that `minari` writes, files that it reads, a named error for every
+//! fault.
 
 use std::path::Path;
 use std::process::Command;
@@ -7,10 +8,10 @@ use crate::common::{enum_flags, environment, synthetic, write};
 use hdf5_pure::FileBuilder;
 use tce_data::{ActionRange, EpisodeEnds, Layout, LoadOptions, Problem, Transitions, load, save_minari};
 
-/// What Minari and gymnasium are here: pinned, in an environment of their own.
+/// Pinned versions of Minari and gymnasium, in an environment of their own.
 const MINARI: [&str; 5] = ["minari[hdf5]==0.5.4", "gymnasium==1.2.2", "h5py==3.16.0", "numpy==2.2.6", "pillow==11.3.0"];
 
-/// What Python with Minari prints; None, visibly, where there is none.
+/// The output of `script` in Python with Minari; `None`, with a printed note, if there is no such Python.
 fn minari(script: &str, argument: &Path) -> Option<String> {
     let python = match environment("minari-0.5.4", &MINARI, "minari, gymnasium, h5py, PIL") {
         Ok(python) => python,
@@ -76,7 +77,7 @@ print(sum(len(e.rewards) for e in s.iterate_episodes()), repr(float(sum(e.observ
     assert_eq!(t.next_observation(11)[2], 5.0, "the last observation of an episode is the last successor");
     let words = got.report.to_string();
     assert!(words.contains("goal [0], q [1..3], tool/a [3], tool/b [4]"), "{words}");
-    // Discrete actions are a column of numbers; the file itself may be named, too.
+    // Discrete actions become a column of numbers; the file itself may be passed, too.
     let got = load(&dir.path().join("test/cartpole-v0/data/main_data.hdf5"), &LoadOptions::default()).unwrap();
     let t = &got.transitions;
     assert_eq!((t.obs_dim, t.act_dim), (4, 1));
@@ -125,7 +126,7 @@ assert all(len(x.observations) == len(x.actions) + 1 for x in e) and all(s.obser
     assert!((sums[0] - sum(&t.observations) - ends).abs() < 1e-4 && (sums[1] - sum(&t.actions)).abs() < 1e-4);
 }
 
-/// A file in robomimic's layout, as its documentation describes it: `demos` demonstrations of 4 steps.
+/// A file in robomimic's layout, as in its documentation: `demos` demonstrations of 4 steps.
 fn robomimic(demos: usize, with_next: bool, dones: bool) -> FileBuilder {
     let mut b = FileBuilder::new();
     let mut data = b.create_group("data");
@@ -169,7 +170,7 @@ fn robomimics_demonstrations_are_read_in_the_order_of_their_numbers() {
     let words = got.report.to_string();
     assert!(words.contains("eef [0], joint [1..3]") && words.contains("left out: agentview_image"), "{words}");
 
-    // Without next_obs the last row of a demonstration has no successor: it stays where it is terminal.
+    // Without next_obs the last row of a demonstration has no successor: it is kept only if it is terminal.
     let got = load(&write(&dir, "short.hdf5", robomimic(3, false, true)), &LoadOptions::default()).unwrap();
     assert_eq!((got.report.rows_kept, got.report.unknown_successors), (12, 3));
     assert_eq!(got.transitions.next_observation(1)[0], 2.0);
@@ -226,7 +227,7 @@ fn episodes_without_a_step_are_left_out() {
     assert!(got.report.to_string().contains("1 episodes without a step were left out"), "{}", got.report);
 }
 
-/// Fields under other names, and flags that say too little.
+/// Fields under other names, and flags that do not say enough.
 #[test]
 fn likely_fields_are_read_and_doubtful_ones_are_named() {
     let dir = tempfile::tempdir().unwrap();
@@ -279,7 +280,7 @@ fn infos_timeouts_are_time_outs_and_all_columns_can_be_had() {
         "{}",
         got.report
     );
-    // They are written, and read again.
+    // They are written and read again.
     let columns: Vec<(&str, &[f32])> = got.columns.iter().map(|(k, v)| (k.as_str(), v.as_slice())).collect();
     let again = dir.path().join("again.hdf5");
     tce_data::save_d4rl(&again, &got.transitions, &Default::default(), &columns).unwrap();
@@ -300,7 +301,7 @@ fn infos_timeouts_are_time_outs_and_all_columns_can_be_had() {
     assert!(got.report.to_string().contains("`infos/timeouts` was read as such"), "{}", got.report);
 }
 
-/// A file that a hard link makes endless: a group in itself.
+/// A hard link makes the file endless: a group contains itself.
 #[test]
 fn a_group_in_itself_is_refused() {
     let dir = tempfile::tempdir().unwrap();

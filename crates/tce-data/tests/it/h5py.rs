@@ -1,4 +1,4 @@
-//! Python's h5py as a check of our files, and as a writer of others.
+//! Uses Python's h5py to check our files and to write others.
 
 use std::collections::BTreeMap;
 
@@ -67,12 +67,12 @@ with h5py.File(sys.argv[1], "w") as f:
     assert_eq!(got.transitions.observation(1), [3.0, 4.0, 5.0]);
     assert_eq!(got.transitions.next_observation(1232), [3702.0, 3703.0, 3704.0]);
     assert!(!got.transitions.known[1233], "the next row is another episode's first");
-    // Row 999 of the file is gone: row 1234 is row 1233 here.
+    // Row 999 of the file was dropped: row 1234 is row 1233 here.
     assert_eq!(got.transitions.terminals.iter().position(|&t| t), Some(1233));
     assert_eq!(tce_data::read_attributes(&path).unwrap()["who"], "h5py");
 }
 
-/// A data set of a terabyte of which nothing, or one chunk, was written.
+/// A data set of a terabyte of which nothing, or only one chunk, was written.
 #[test]
 fn sparse_giants_are_refused_at_once() {
     let dir = tempfile::tempdir().unwrap();
@@ -95,7 +95,7 @@ with h5py.File(sys.argv[1], "w") as f:
     assert_eq!(error.problem(), Some(tce_data::Problem::Oversized), "{error}");
     assert!(started.elapsed().as_secs() < 5);
 
-    // Vectors are filled where nothing was written, but not to any length.
+    // Vectors are filled if nothing was written, but only up to a limited length.
     for kind in
         ["shape=(n,), dtype='f4'", "shape=(n,), dtype=bool, chunks=(10,)", "shape=(n,), dtype=bool, chunks=(10**9,)"]
     {

@@ -1,4 +1,4 @@
-//! Names that are links or groups, in old-style and new-style files as h5py writes them.
+//! Tests of names that are links or groups, in old-style and new-style files written by h5py.
 
 use std::fs;
 use std::path::Path;
@@ -117,7 +117,7 @@ f = write("root", libver, ["timeouts"]); f["timeouts"] = h5py.SoftLink("/")
     }
 }
 
-/// What is not read may be anything, and is in the list of what is there.
+/// Fields that are not read may have any content, and are listed with the names in the file.
 #[test]
 fn other_names_do_not_matter() {
     let dir = tempfile::tempdir().unwrap();
@@ -144,7 +144,7 @@ f["c"] = h5py.SoftLink("c"); f["type"] = np.dtype("f4"); f["infos/deep/soft"] = 
     });
 }
 
-/// Hundreds of damaged bytes in files with links: an error or rows, never a panic, never a huge allocation.
+/// Hundreds of damaged bytes in files with links: the result is an error or rows, never a panic or a huge allocation.
 #[test]
 fn damaged_links_never_panic() {
     let dir = tempfile::tempdir().unwrap();

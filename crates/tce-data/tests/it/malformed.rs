@@ -1,4 +1,4 @@
-//! Files that must be refused, each with a message that says what to do; and files that are merely broken.
+//! Files that must be refused, each with a message that says what to do, and damaged files.
 
 use std::fs;
 use std::sync::atomic::Ordering::Relaxed;
@@ -7,7 +7,7 @@ use crate::common::{LARGEST, assert_refused, load, rows, write};
 use hdf5_pure::FileBuilder;
 use tce_data::{Agent, LoadOptions, Problem, check};
 
-/// D4RL's fields of `rows(8)`, except `leave_out`, which `replace` writes (or not).
+/// D4RL's fields of `rows(8)`, except `leave_out`, which `replace` may write.
 fn without(leave_out: &str, replace: impl FnOnce(&mut FileBuilder)) -> FileBuilder {
     let r = rows(8);
     let mut b = FileBuilder::new();
@@ -210,7 +210,7 @@ fn a_group_in_a_fields_place_is_named() {
     }
 }
 
-/// Float32 skips integers from 2^24 on: a file that loses digits says so, one that does not is silent.
+/// Float32 cannot represent every integer from 2^24 on: a warning is given exactly if a file loses digits.
 #[test]
 fn integers_that_lose_digits_are_told() {
     let dir = tempfile::tempdir().unwrap();
@@ -243,7 +243,7 @@ fn actions_outside_of_the_box_are_a_warning() {
     assert!(load(&write(&dir, "a.hdf5", r.with_next(r.d4rl()))).unwrap().report.warnings.is_empty());
     r.actions[5] = -1.5;
     let got = load(&write(&dir, "a.hdf5", r.with_next(r.d4rl()))).unwrap();
-    // The robots of the benchmark clamp them; other people's have units of their own.
+    // The robots of the benchmark clamp them; users' robots have their own units.
     let of =
         |agent| check(&got.transitions, agent).findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
     let text = of(Some(Agent::Hopper));
@@ -251,7 +251,7 @@ fn actions_outside_of_the_box_are_a_warning() {
     assert!(of(None).contains("note: actions: they range over -1.5:"), "{}", of(None));
 }
 
-/// Deflate reaches 1000 : 1, so 16 MB of zeros in a few kilobytes are legitimate; that they are not eight rows is not.
+/// Deflate reaches 1000 : 1, so 16 MB of zeros in a few kilobytes are valid; but they are not eight rows.
 #[test]
 fn a_well_compressed_data_set_is_not_mistaken_for_damage() {
     let dir = tempfile::tempdir().unwrap();
@@ -263,7 +263,7 @@ fn a_well_compressed_data_set_is_not_mistaken_for_damage() {
     assert_refused(load(&path).unwrap_err(), Problem::RowCount, &path, "rewards", &["4000000 rows", "8 rows"]);
 }
 
-/// Every cut of a small file, and thousands of damaged bytes: an error or rows, never a panic, never a huge allocation.
+/// Every truncation of a small file, thousands of damaged bytes: an error or rows, never a panic or a huge allocation.
 #[test]
 fn damage_never_panics() {
     let dir = tempfile::tempdir().unwrap();

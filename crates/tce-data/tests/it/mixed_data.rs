@@ -1,4 +1,4 @@
-//! What is decided and found on the public target data, where they are at hand.
+//! Choices and findings on the public target data, if they are available.
 //! `cargo nextest run --release -p tce-data mixed_data` prints the decisions.
 
 use tce_data::{
@@ -23,7 +23,7 @@ fn pairs() -> Vec<(String, Transitions, Transitions)> {
     Agent::ALL.into_iter().flat_map(|agent| SHIFTS.map(|shift| of(agent, shift))).collect()
 }
 
-/// The episodes of `t` that did not end with the file, at most `count`, from the `skip`th on (around the end).
+/// Episodes of `t` that the end of the file did not cut: at most `count`, from index `skip` on, wrapping around.
 fn whole(t: &Transitions, count: usize, skip: usize) -> Vec<Episode> {
     let mut all = t.episodes();
     let limit = all.iter().map(|e| e.end - e.start).max().unwrap();
@@ -32,7 +32,7 @@ fn whole(t: &Transitions, count: usize, skip: usize) -> Vec<Episode> {
     (0..count.min(n)).map(|k| all[(k + skip) % n]).collect()
 }
 
-/// Episodes one after the other; the last one without its last `cut` share.
+/// Concatenates episodes; the last one loses its last `cut` share.
 fn join(parts: &[(&Transitions, Vec<Episode>)], cut: f64) -> Transitions {
     let mut out = Transitions::new(parts[0].0.obs_dim, parts[0].0.act_dim);
     for (t, episodes) in parts {
@@ -92,7 +92,7 @@ fn of_mixed_sets_the_expert_part_is_kept() {
                         let c = choose_trajectories_with(&t, gap);
                         *count += (c.is_selective() && c.episodes == episodes[good.clone()]) as usize;
                     }
-                    // With hardly any expert rows, or hardly any others, keeping everything is right too.
+                    // With very few expert rows, or very few others, keeping everything is also right.
                     let expert_rows: usize = episodes[good.clone()].iter().map(|e| e.end - e.start).sum();
                     let kind = match (expert_rows, t.len() - expert_rows) {
                         (0..500, _) => "no expert rows to speak of",

@@ -1,4 +1,4 @@
-//! The public target data, where they are at hand.
+//! Tests on the public target data, if they are available.
 
 use std::fs;
 
@@ -25,7 +25,7 @@ fn files() -> Option<Vec<(Agent, Shift, Quality, Transitions)>> {
                 );
                 assert_eq!(got.report.warnings, [""; 0]);
                 assert_eq!(got.report.episodes, EpisodeEnds::Continuity);
-                // Nothing of it hangs on the step limit.
+                // The result does not depend on the step limit.
                 let own = load(
                     &shared.join(format!("datasets/otdf/{agent}_{}_{quality}.hdf5", shift.file_name())),
                     &LoadOptions::default(),
@@ -38,8 +38,8 @@ fn files() -> Option<Vec<(Agent, Shift, Quality, Transitions)>> {
     Some(out)
 }
 
-/// The scores of the data's own behaviour, as measured by another program (datasets.md): morph, kinematic, gravity, each
-/// medium then expert.
+/// The scores of the policies that collected the data, measured by another program (datasets.md): morph, kinematic,
+/// gravity, each medium then expert.
 const SCORES: [[f64; 6]; 4] = [
     [44.4, 99.1, 41.4, 99.2, 46.8, 86.0],
     [63.1, 100.1, 66.2, 100.1, 73.4, 125.0],
@@ -71,7 +71,7 @@ fn every_file_is_recognised_and_passes_the_checks() {
         let c = check(t, Some(*agent));
         let worse = c.findings.iter().find(|f| f.severity > Severity::Note);
         assert!(worse.is_none(), "{agent} {shift} {quality}: {worse:?}");
-        // Their simulator cuts velocities off at 10.
+        // Their simulator clips velocities at 10.
         assert!(*agent != Agent::Walker2d || c.findings.iter().any(|f| f.message.contains("10")), "{:?}", c.findings);
     }
     for (a, _, _, source) in files.iter().step_by(6) {
@@ -81,7 +81,7 @@ fn every_file_is_recognised_and_passes_the_checks() {
     }
 }
 
-/// No live dimension of a state or of a difference s' - s is attenuated by the floor, nothing but Ant's zeros is dead.
+/// The floor attenuates no live dimension of a state or of a difference s' - s, and only Ant's zeros are dead.
 #[test]
 fn the_floor_leaves_every_real_signal_alone() {
     let Some(files) = files() else { return };
@@ -95,7 +95,7 @@ fn the_floor_leaves_every_real_signal_alone() {
             eprintln!("{agent} {shift} {quality} {what}: smallest / median std {:.2e}", live[0] / live[live.len() / 2]);
             assert_eq!((s.dead.len(), s.floored.len()), (dead, 0), "{agent} {shift} {quality} {what}");
         }
-        // Eq. 8 at the paper's threshold rejects a good many real pairs; an implementation error would reject all or none.
+        // Eq. 8 at the paper's threshold rejects many real pairs; an implementation error would reject all or none.
         let kept = zscore_keep(&Rows::state_pairs(t), 3.0).iter().filter(|&&k| k).count();
         eprintln!("{agent} {shift} {quality}: z = 3 rejects {:.1} %", 100.0 - kept as f64 / 50.0);
         assert!((3500..5000).contains(&kept));
@@ -117,7 +117,7 @@ fn damaged_real_files_never_panic() {
         fs::write(&path, &whole[..whole.len() * i / 150]).unwrap();
         assert!(load(&path, &crate::common::benchmark()).is_err(), "cut {i}");
         let mut bytes = whole.clone();
-        // Half of the flips hit the metadata at the front, half are spread over the file.
+        // Half of the flips are in the metadata at the front, half are spread over the file.
         let at = if i % 2 == 0 { 13 * i } else { whole.len() * i / 150 };
         bytes[at] ^= 0x10;
         fs::write(&path, &bytes).unwrap();

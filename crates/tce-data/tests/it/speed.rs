@@ -1,4 +1,4 @@
-//! Timings at the size of the benchmark. Not tests: run them by hand with
+//! Timings at the size of the benchmark. They are not tests: run them by hand with
 //! `cargo nextest run --release -p tce-data --run-ignored only --no-capture speed`.
 
 use std::collections::BTreeMap;

@@ -1,4 +1,4 @@
-//! The ways in which h5py stores the same numbers: all that are read are read right, the others are named.
+//! Tests of the ways in which h5py stores the same numbers: read correctly if supported, otherwise a clear error.
 
 use std::fs;
 
@@ -84,7 +84,7 @@ for libver in VERSIONS:
         let name = path.file_stem().unwrap().to_str().unwrap();
         let got = load(&path).unwrap_or_else(|e| panic!("{name}: {e}")).transitions;
         assert_eq!(got.len(), 1003, "{name}");
-        // Float16 has 11 bits: half of the numbers above 2048 are not among them, but 1003 is below.
+        // Float16 has 11 bits: half of the numbers above 2048 cannot be represented, but 1003 can.
         assert_eq!(got.observations, want.observations, "{name}");
         assert_eq!((&got.actions, &got.rewards), (&want.actions, &want.rewards), "{name}");
         for i in 0..1003 {
@@ -135,7 +135,7 @@ for libver in VERSIONS:
     assert_eq!(read, 72);
 }
 
-/// What was created and never written: the fill value for vectors (as h5py reads it), refused for states and actions.
+/// Data that were created but never written: the fill value for vectors (as in h5py), an error for states and actions.
 #[test]
 fn unwritten_fields() {
     let dir = tempfile::tempdir().unwrap();
@@ -185,7 +185,7 @@ for libver in ["earliest", "latest"]:
     }
 }
 
-/// Another filter's number in the place of LZF's: what the reader sees of a file that needs a plugin.
+/// The number of another filter replaces that of LZF: to the reader, the file needs a plugin.
 #[test]
 fn filters_that_are_not_read_are_named() {
     let dir = tempfile::tempdir().unwrap();
@@ -196,7 +196,7 @@ fill(open_file("lzf"), observations=None).create_dataset("observations", data=st
         return;
     }
     let bytes = fs::read(dir.path().join("lzf.hdf5")).unwrap();
-    // In the message: number, length of the name, flags, count of parameters, name.
+    // The message holds: number, length of the name, flags, count of parameters, name.
     let at = bytes.windows(4).position(|w| w == b"lzf\0").unwrap() - 8;
     assert_eq!(bytes[at..at + 4], [0x00, 0x7d, 8, 0]);
     for (id, name, advice) in [

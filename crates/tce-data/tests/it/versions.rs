@@ -1,4 +1,4 @@
-//! Our files in old and new HDF5 libraries, number by number.
+//! Reads our files with old and new HDF5 libraries and compares every number.
 
 use std::fs;
 use std::path::Path;
@@ -7,16 +7,16 @@ use std::process::Command;
 use crate::common::{environment, synthetic};
 use tce_data::save_d4rl;
 
-/// Name of the environment, the library inside, and what pip installs. The oldest and the newest h5py that Python 3.11
-/// runs: HDF5 1.12 (which reads what 1.10 and 1.14 read) and HDF5 2.0, which checks more than those before it.
+/// Name of the environment, the library inside, and what pip installs. These are the oldest and the newest h5py that
+/// run on Python 3.11: HDF5 1.12 (which reads what 1.10 and 1.14 read) and HDF5 2.0, which has stricter checks.
 const VERSIONS: [(&str, &str, [&str; 2]); 2] = [
     ("h5py-3.8.0", "1.12.", ["h5py==3.8.0", "numpy==1.26.4"]),
     ("h5py-3.16.0", "2.0.", ["h5py==3.16.0", "numpy==2.2.6"]),
 ];
-/// Around 65,536 is where chunks once had sides that HDF5 2.0 refuses.
+/// Around 65,536, chunks once had sides that HDF5 2.0 rejects.
 const ROWS: [usize; 5] = [10, 5_000, 65_535, 65_536, 70_000];
 
-/// Compares every data set with the raw numbers beside the file.
+/// Compares every data set with the raw numbers stored beside the file.
 const COMPARE: &str = r#"
 import sys, os, h5py, numpy as np
 folder, rows = sys.argv[1], sys.argv[2:]

@@ -4,14 +4,14 @@ use std::io::Result;
 
 use super::image::{Fields, Image, MAX_READ, malformed};
 
-/// Records of one index: far more links than a group of a file of transitions has.
+/// Most records of one index: far more links than a group of a transitions file has.
 const MAX_RECORDS: u64 = 1 << 20;
-/// Depth of the index, and of the heap's table of tables.
+/// Largest depth of the index, and of the heap's nested tables.
 const MAX_DEPTH: u64 = 16;
-/// Signature, version, type and checksum of a tree node.
+/// Bytes of signature, version, type and checksum of a tree node.
 const NODE_OVERHEAD: u64 = 10;
 
-/// A fractal heap: blocks of doubling size under a table of `width` blocks a row.
+/// A fractal heap: blocks of doubling size, indexed by a table with `width` blocks per row.
 pub(super) struct Heap<'a> {
     image: &'a Image,
     id_bytes: usize,
@@ -24,7 +24,7 @@ pub(super) struct Heap<'a> {
     root_rows: u64,
 }
 
-/// Bytes that hold every number up to `limit`.
+/// Number of bytes that can hold every number up to `limit`.
 fn bytes_for(limit: u64) -> usize {
     (limit.max(1).ilog2() / 8 + 1) as usize
 }
@@ -42,7 +42,7 @@ impl<'a> Heap<'a> {
         }
         f.byte()?;
         let largest_object = f.uint(4)?;
-        // Huge objects, free space, and counts.
+        // Skip huge objects, free space and counts.
         f.take(l + o + l + o + 8 * l)?;
         let width = f.uint(2)?;
         let first = f.uint(l)?;
@@ -64,7 +64,7 @@ impl<'a> Heap<'a> {
         Ok(Self { image, id_bytes, offset_bytes, length_bytes, width, first, direct_rows, root, root_rows })
     }
 
-    /// Every object that the index at `address` lists.
+    /// All objects that the index at `address` lists.
     pub fn all(&self, address: u64) -> Result<Vec<Vec<u8>>> {
         let (o, l) = (self.image.offset, self.image.length);
         let header = self.image.read(address, (22 + o + l) as u64)?;
@@ -84,7 +84,7 @@ impl<'a> Heap<'a> {
         if total > MAX_RECORDS {
             return Err(malformed(format!("an index of {total} names")));
         }
-        // How wide the counts in child pointers are, level by level.
+        // Width of the counts in child pointers, for each level.
         let leaf = (node - NODE_OVERHEAD) / record;
         let mut index =
             Index { node, record, count_bytes: bytes_for(leaf), below: vec![leaf], left: total, bytes: MAX_READ };
@@ -111,7 +111,7 @@ impl<'a> Heap<'a> {
         f.take(2)?;
         for _ in 0..records {
             let mut entry = Fields(f.take(index.record as usize)?);
-            entry.take(4)?; // the name's hash
+            entry.take(4)?; // hash of the name
             let object = self.object(entry.take(self.id_bytes)?)?;
             let left = index.bytes.checked_sub(object.len() as u64);
             index.bytes = left.ok_or_else(|| malformed("links that overlap"))?;
@@ -121,7 +121,7 @@ impl<'a> Heap<'a> {
             for _ in 0..=records {
                 let mut child = Fields(f.take(pointer as usize)?);
                 let (address, count) = (child.uint(self.image.offset)?, child.uint(index.count_bytes)?);
-                // An empty child would cost nothing of what is left, and could be its own child.
+                // An empty child would not reduce the remaining count, so it could be its own child without end.
                 if count == 0 {
                     return Err(malformed("an index of names with an empty node"));
                 }
@@ -131,7 +131,7 @@ impl<'a> Heap<'a> {
         Ok(())
     }
 
-    /// The object of a heap identifier.
+    /// The object with a heap identifier.
     fn object(&self, id: &[u8]) -> Result<Vec<u8>> {
         let mut f = Fields(id);
         match f.byte()? >> 4 & 3 {
@@ -154,7 +154,7 @@ impl<'a> Heap<'a> {
             return Ok((table, 0));
         }
         for _ in 0..MAX_DEPTH {
-            // The row that holds it: rows 0 and 1 have blocks of the first size, each further one of twice the size.
+            // The row that contains it: rows 0 and 1 have blocks of the first size, each further row doubles the size.
             let place = offset - start;
             let units = place / self.first / self.width;
             let row = if units == 0 { 0 } else { u64::from(units.ilog2()) + 1 };
@@ -174,7 +174,7 @@ impl<'a> Heap<'a> {
                 return Ok((child, start));
             }
             table = child;
-            // A table as a child has as many rows as its share of the heap needs.
+            // A child table has as many rows as its share of the heap needs.
             rows =
                 (u64::from(size.ilog2())).saturating_sub(u64::from(self.first.saturating_mul(self.width).ilog2())) + 1;
         }
@@ -187,16 +187,16 @@ struct Index {
     node: u64,
     record: u64,
     count_bytes: usize,
-    /// The most records at and below a node, by level.
+    /// The largest number of records in and below a node, by level.
     below: Vec<u64>,
-    /// Records that the header announces and that have not been seen.
+    /// Records that the header declares and that have not been read yet.
     left: u64,
-    /// How many bytes of links may still come.
+    /// Bytes of links that may still be read.
     bytes: u64,
 }
 
 impl Index {
-    /// Bytes of a child pointer in a node of this level: address, records of the child, records below it.
+    /// Bytes of a child pointer in a node of this level: address, records in the child, records below it.
     fn pointer(&self, offset: usize, level: u64) -> u64 {
         let below = if level > 1 { bytes_for(self.below[level as usize - 1]) } else { 0 };
         (offset + self.count_bytes + below) as u64

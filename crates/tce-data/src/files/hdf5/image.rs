@@ -1,4 +1,4 @@
-//! The bytes of a file: read at addresses, cut into fields, or shown with others in their place.
+//! The bytes of a file: read at an address, split into fields, or patched for the HDF5 library.
 
 use std::fs::File;
 use std::io::{Error, ErrorKind, Read, Result, Seek, SeekFrom};
@@ -6,27 +6,27 @@ use std::sync::{Mutex, PoisonError};
 
 use hdf5_pure::Superblock;
 
-/// More than any header block, heap segment or tree node of a valid file has.
+/// More than any header block, heap segment or tree node of a valid file.
 pub(super) const MAX_READ: u64 = 16 << 20;
 
-/// A file with other bytes in some places, and more of them.
+/// A file with some bytes replaced and others appended.
 pub(super) struct Patch {
-    /// Shown from this position on in the place of the file's own bytes.
+    /// Replaces the file's own bytes from this position on.
     pub start: u64,
     pub bytes: Vec<u8>,
-    /// Shown behind the file's end.
+    /// Appended after the file's end.
     pub behind: Vec<u8>,
 }
 
-/// The file as addresses and fields of the widths its superblock announces.
+/// The file, read as addresses and fields of the widths that its superblock declares.
 pub(super) struct Image {
-    /// Reading moves the file's position: one thread at a time.
+    /// Reading moves the file's position, so one thread reads at a time.
     file: Mutex<File>,
     pub bytes: u64,
     pub base: u64,
-    /// Bytes of an address.
+    /// Bytes per address.
     pub offset: usize,
-    /// Bytes of a length.
+    /// Bytes per length.
     pub length: usize,
 }
 
@@ -69,12 +69,12 @@ impl Image {
         Self { file: Mutex::new(file), bytes, base: superblock.base_address.get(), offset, length }
     }
 
-    /// Whether an address means "nothing there".
+    /// Whether an address means "no object".
     pub fn undefined(&self, address: u64) -> bool {
         address == u64::MAX >> (64 - 8 * self.offset.clamp(1, 8))
     }
 
-    /// `length` bytes at `address`.
+    /// Reads `length` bytes at `address`.
     pub fn read(&self, address: u64, length: u64) -> Result<Vec<u8>> {
         let start = self.base.checked_add(address).filter(|_| !self.undefined(address));
         let start = start.ok_or_else(|| malformed("an address outside of the file"))?;

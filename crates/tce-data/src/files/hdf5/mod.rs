@@ -1,8 +1,8 @@
-//! Reading numbers out of HDF5 files that may be anything.
+//! Reads numbers from HDF5 files of unknown origin.
 //!
-//! `hdf5-pure` reads the data sets; what it does not do is done here: links are followed ([`names`]), newer layout
-//! messages are put into its terms ([`modern`]), what is not in the file is found before memory is asked for
-//! ([`storage`]), and what float32 cannot hold is told ([`numbers`]).
+//! `hdf5-pure` reads the data sets. The rest is done here: links are followed ([`names`]), newer layout messages are
+//! rewritten for the library ([`modern`]), missing data are detected before memory is allocated ([`storage`]), and
+//! numbers that float32 cannot hold are reported ([`numbers`]).
 
 mod heap;
 mod image;
@@ -27,11 +27,11 @@ use self::storage::Unwritten;
 use crate::{DataError, Problem};
 
 const REPAIR: &str = "The file is damaged or incomplete: fetch or write it again";
-/// A file of plain data sets out of one of any kind that h5py reads.
+/// Command that copies any file that h5py reads into a file of plain data sets.
 const COPY: &str = "`python -c \"import h5py; i = h5py.File('in.hdf5'); o = h5py.File('out.hdf5', 'w'); \
                     [o.create_dataset(k, data=i[k][()]) for k in i if isinstance(i.get(k), h5py.Dataset)]\"`";
 
-/// An open file. Reads on demand, so that memory follows the data sets that are asked for.
+/// An open file. Data sets are read on demand, so memory use depends on the data sets that are requested.
 pub(super) struct Hdf5 {
     path: PathBuf,
     bytes: u64,
@@ -49,16 +49,16 @@ pub(super) struct Column {
     pub rounded: bool,
 }
 
-/// What a field must look like.
+/// The expected form of a field.
 #[derive(Clone, Copy)]
 enum Kind {
-    /// (N, D), D >= 1. Must have been written.
+    /// (N, D), D >= 1. The data must have been written.
     Matrix,
-    /// As a matrix; numbers need not be finite.
+    /// Like `Matrix`, but numbers may be NaN or infinite.
     Gaps,
-    /// (N, D) or (N,). Must have been written.
+    /// (N, D) or (N,). The data must have been written.
     Table,
-    /// (N,) or (N, 1). What was never written is the fill value.
+    /// (N,) or (N, 1). Data that were never written are read as the fill value.
     Vector,
 }
 
@@ -67,7 +67,7 @@ impl Hdf5 {
         Self::open_noting(path, Arc::default())
     }
 
-    /// A second handle, for another thread. Its notes are this one's.
+    /// A second handle for another thread. It shares the notes of this one.
     pub fn reopen(&self) -> Result<Self, DataError> {
         Self::open_noting(&self.path, Arc::clone(&self.notes))
     }
@@ -101,7 +101,7 @@ impl Hdf5 {
         Ok(Self { path: path.to_owned(), bytes, file, names, notes })
     }
 
-    /// The names in the group at `path` (empty: the top level); none if that is no group.
+    /// The names in the group at `path` (empty: the top level); `None` if it is not a group.
     pub fn names_in(&self, path: &str) -> Result<Option<Vec<String>>, DataError> {
         match self.names.find(path).map_err(|e| unreadable(&self.path, path, e))? {
             Found::Group(names) => Ok(Some(names)),
@@ -109,7 +109,7 @@ impl Hdf5 {
         }
     }
 
-    /// The paths of the data sets at the top level and in its groups.
+    /// The paths of the data sets at the top level and in its groups (one level deep).
     pub fn all_datasets(&self) -> Result<Vec<String>, DataError> {
         let mut out = Vec::new();
         for name in self.names_in("")?.unwrap_or_default() {
@@ -121,47 +121,47 @@ impl Hdf5 {
         Ok(out)
     }
 
-    /// Whether the top level has this name, be it a data set, a group or a link; or whether this path leads somewhere.
+    /// Whether this name exists at the top level (data set, group or link), or whether this path leads to an object.
     pub fn has(&self, name: &str) -> bool {
         self.names.has(name)
     }
 
-    /// What the user should know about the numbers read so far: those that float32 cannot hold, those never written.
+    /// Notes for the user on the numbers read so far: those that float32 cannot hold, those that were never written.
     pub fn notes(&self) -> Vec<String> {
         let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        // Two handles may have read side by side.
+        // Two handles may have read in parallel.
         notes.sort();
         notes
     }
 
-    /// The root's attributes as text.
+    /// The attributes of the root group, as text.
     pub fn attributes(&self) -> Result<BTreeMap<String, String>, DataError> {
         let attributes = guard(&self.path, "attributes", || self.file.root().attrs())?;
         let text = |v: AttrValue| v.as_str().map_or_else(|| v.to_string(), str::to_owned);
         Ok(attributes.into_iter().map(|(k, v)| (k, text(v))).collect())
     }
 
-    /// A matrix: shape (N, D), D >= 1.
+    /// Reads a matrix of shape (N, D), D >= 1.
     pub fn matrix(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Matrix)
     }
 
-    /// A matrix that may hold NaN and infinity.
+    /// Reads a matrix that may hold NaN and infinity.
     pub fn matrix_with_gaps(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Gaps)
     }
 
-    /// A matrix, or a vector as a matrix of one column: shape (N, D) or (N,).
+    /// Reads a matrix, or a vector as a matrix of one column: shape (N, D) or (N,).
     pub fn table(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Table)
     }
 
-    /// A vector: shape (N,) or (N, 1).
+    /// Reads a vector: shape (N,) or (N, 1).
     pub fn vector(&self, name: &str) -> Result<Column, DataError> {
         self.read(name, Kind::Vector)
     }
 
-    /// A vector of 0 and 1, however it is stored.
+    /// Reads a vector of 0 and 1, stored as any number type.
     pub fn flags(&self, name: &str) -> Result<Vec<bool>, DataError> {
         let column = self.vector(name)?;
         if let Some(row) = column.data.iter().position(|&x| x != 0.0 && x != 1.0) {
@@ -182,7 +182,7 @@ impl Hdf5 {
         DataError::invalid(problem, &self.path, field, found, expected, advice)
     }
 
-    /// The error of a field that is not there.
+    /// The error for a missing field.
     pub fn missing(&self, name: &str) -> DataError {
         let names = self.names.list();
         let keys = if names.is_empty() { "no data sets".into() } else { names.join(", ") };
@@ -199,7 +199,7 @@ impl Hdf5 {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
 
-    /// The data set that `name` means, through whatever links.
+    /// The data set with this `name`, through any links.
     fn open_dataset(&self, name: &str) -> Result<Dataset, DataError> {
         let (path, header) = match self.names.find(name).map_err(|e| unreadable(&self.path, name, e))? {
             Found::At { path, header } => (path, header),
@@ -274,7 +274,7 @@ impl Hdf5 {
         };
         let filled = self.ensure_stored(name, &dataset, unwritten)?;
         let data = guard(&self.path, name, || numbers::read_f32(&dataset, &datatype))?;
-        // The product fits: `ensure_stored` has compared it with the file's size.
+        // The product does not overflow: `ensure_stored` has compared it with the file's size.
         if data.len() as u64 != rows * dim {
             let found = format!("{} numbers for shape {shape:?}", data.len());
             return Err(self.invalid(Problem::Malformed, name, found, "as many as the shape says", REPAIR));
@@ -311,7 +311,7 @@ impl Hdf5 {
         };
         let bad = data.iter().filter(|x| !x.is_finite()).count();
         let place = format!("in row {}, column {} ({bad} such values)", at / dim, at % dim);
-        // An infinity may be a float64 that is none.
+        // An infinity may be a finite float64 in the file.
         let stored = guard(&self.path, name, || Ok(numbers::finite_f64(dataset, datatype, at, dim)))?;
         let (found, advice) = match stored {
             Some(x) => {
@@ -323,7 +323,7 @@ impl Hdf5 {
     }
 }
 
-/// Puts a failure of the link tables into our words.
+/// Converts a failure of the link tables into a `DataError`.
 fn unreadable(path: &Path, field: &str, e: io::Error) -> DataError {
     let problem = match e.kind() {
         io::ErrorKind::InvalidData => Problem::Malformed,
@@ -333,10 +333,10 @@ fn unreadable(path: &Path, field: &str, e: io::Error) -> DataError {
     DataError::invalid(problem, path, field, e.to_string(), "a file that follows the HDF5 format", REPAIR)
 }
 
-/// Runs one call of the HDF5 library and puts its failure, a panic included, into our words.
+/// Runs one call of the HDF5 library and converts a failure, also a panic, into a `DataError`.
 fn guard<T>(path: &Path, field: &str, call: impl FnOnce() -> Result<T, hdf5_pure::Error>) -> Result<T, DataError> {
     let malformed = |problem, found: String| {
-        // What the library does not know yet is no damage.
+        // A feature that the library does not support yet is not damage.
         let repair = if found.contains("version") || found.contains("unsupported") {
             format!("Written by a newer HDF5, or damaged. Store it anew: {COPY}")
         } else {

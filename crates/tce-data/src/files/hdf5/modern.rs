@@ -1,12 +1,12 @@
-//! Layout messages that `hdf5-pure` does not read, rewritten into those that it does.
+//! Rewrites layout messages that `hdf5-pure` does not read into messages that it reads.
 //!
-//! Two kinds are in files written by h5py with libver="latest":
-//! - Version 5 (HDF5 2.0, compressed data sets). It differs from version 4 in one thing: the size of a compressed chunk
-//!   takes eight bytes in the chunk index, not as few as will do. The index states how wide its entries are, and the
-//!   library goes by that: it reads such a data set once the message says 4.
+//! h5py writes two such kinds with libver="latest":
+//! - Version 5 (HDF5 2.0, compressed data sets). It differs from version 4 in one point: the size of a compressed chunk
+//!   takes eight bytes in the chunk index instead of the fewest possible. The library reads the width of the entries
+//!   from the index, so it reads such a data set once the message says version 4.
 //! - Chunk sides of three bytes (HDF5 1.10 and later, chunks of 65,536 rows and more). The library knows 1, 2, 4 and 8.
 //!
-//! The library is shown a file whose header has the rewritten message.
+//! The library is given a view of the file whose header has the rewritten message.
 
 use std::fs;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -17,18 +17,18 @@ use hdf5_pure::{Error, File, FormatError, Source};
 
 use super::image::Patch;
 
-/// Opens the file with `patch` in its place.
+/// Opens the file with `patch` applied.
 pub(super) fn open(path: &Path, bytes: u64, patch: Patch) -> Result<File, Error> {
     let file = fs::File::open(path).map_err(Error::Io)?;
     File::from_source(Patched { file: Mutex::new(file), bytes, patch })
 }
 
-/// The message that says the same in the library's terms; `None` if it is in them already, or is none of ours.
+/// The rewritten message; `None` if the library reads the message as it is, or if it is of neither kind above.
 pub(super) fn rewritten(layout: &[u8]) -> Option<Vec<u8>> {
     let &[version @ (4 | 5), class, ref rest @ ..] = layout else {
         return None;
     };
-    // 2: chunked, with flags, the number of sides, their width, and the sides.
+    // 2: chunked, followed by flags, the number of sides, their width, and the sides.
     let &[flags, sides, width, ref rest @ ..] = rest else {
         return None;
     };
@@ -78,7 +78,7 @@ impl Source for Patched {
     }
 }
 
-/// Writes what `new`, which starts at `start`, and `buf`, which starts at `offset`, have in common into `buf`.
+/// Copies the overlap of `new`, which starts at `start`, and `buf`, which starts at `offset`, into `buf`.
 fn overlay(buf: &mut [u8], offset: u64, new: &[u8], start: u64) {
     let first = offset.max(start);
     let last = offset.saturating_add(buf.len() as u64).min(start + new.len() as u64);
@@ -88,11 +88,11 @@ fn overlay(buf: &mut [u8], offset: u64, new: &[u8], start: u64) {
     }
 }
 
-/// Bob Jenkins's lookup3 (`hashlittle`, seed 0): HDF5's checksum of metadata.
+/// Bob Jenkins's lookup3 (`hashlittle`, seed 0), HDF5's metadata checksum.
 pub(super) fn lookup3(data: &[u8]) -> u32 {
     let seed = 0xdead_beef_u32.wrapping_add(data.len() as u32);
     let [mut a, mut b, mut c] = [seed; 3];
-    // The last block, of up to twelve bytes, is mixed in another way.
+    // The last block, of up to twelve bytes, is mixed differently.
     let blocks = data.len().div_ceil(12);
     for (i, block) in data.chunks(12).enumerate() {
         let word = |n: usize| block.iter().skip(4 * n).take(4).rev().fold(0u32, |w, &byte| w << 8 | u32::from(byte));
@@ -124,7 +124,7 @@ pub(super) fn lookup3(data: &[u8]) -> u32 {
 mod tests {
     use super::{lookup3, overlay, rewritten};
 
-    /// Jenkins's own examples, and lengths around a block.
+    /// Jenkins's own examples, and lengths close to a multiple of the block.
     #[test]
     fn known_sums() {
         assert_eq!(lookup3(b""), 0xdead_beef);
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn layouts_are_rewritten() {
-        // Version 4, two-byte sides: nothing to do. Version 5: the version alone. Three-byte sides: four.
+        // Version 4 with two-byte sides: no change. Version 5: only the version changes. Three-byte sides: four bytes.
         assert_eq!(rewritten(&[4, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]), None);
         assert_eq!(rewritten(&[5, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]).unwrap(), [4, 2, 1, 2, 2, 7, 0, 4, 0, 1, 9]);
         let wide = [4, 2, 1, 2, 4, 0, 0, 1, 0, 4, 0, 0, 0, 1, 9];

@@ -1,4 +1,4 @@
-//! From a field's name to the data set it means, through whatever links lie between.
+//! Finds the data set that a field's name refers to, through any links.
 
 use std::fs;
 use std::io;
@@ -9,30 +9,30 @@ use hdf5_pure::Superblock;
 use super::image::{Image, Patch, malformed};
 use super::table::{Link, Links};
 
-/// Soft links that one name may lead through: HDF5's own default.
+/// Largest number of soft links that one name may pass through: HDF5's own default.
 const MAX_LINKS: usize = 16;
 
-/// What a name at the top level means.
+/// What a name at the top level refers to.
 pub(super) enum Found {
     /// There is no such name.
     Absent,
-    /// The object of this path of hard links, which `hdf5-pure` follows.
+    /// The object at this path of hard links, which `hdf5-pure` can follow.
     At { path: String, header: u64 },
-    /// A link that leads to no object of this file.
+    /// A link that leads to no object in this file.
     Nowhere(Broken),
-    /// A group with these members.
+    /// A group, with the names of its members.
     Group(Vec<String>),
 }
 
-/// Why a link leads nowhere.
+/// Why a link leads to no object.
 pub(super) enum Broken {
-    /// To a path that is not there.
+    /// It leads to a path that does not exist.
     Dangling(String),
-    /// Through more links than [`MAX_LINKS`].
+    /// It passes through more than [`MAX_LINKS`] links.
     Circle(String),
-    /// To another file.
+    /// It leads to another file.
     External { file: String, path: String },
-    /// To wherever its writer knows.
+    /// Its kind is known only to the program that wrote it.
     Unknown(u8),
 }
 
@@ -46,14 +46,14 @@ pub(super) struct Names {
 impl Names {
     pub fn open(path: &Path, bytes: u64, superblock: &Superblock) -> io::Result<Self> {
         let image = Image::new(fs::File::open(path)?, bytes, superblock);
-        // The library adds the base (a user block's bytes) to this one address.
+        // The library adds the base (the bytes of a user block) to this one address.
         let root = superblock.root_group_address.checked_sub(superblock.base_address.get());
         let root = root.ok_or_else(|| malformed("a root before the start of the file"))?;
         let top = image.links(root)?.ok_or_else(|| malformed("a root that is not a group"))?;
         Ok(Self { image, root, top })
     }
 
-    /// Whether there is a `name` at the top level, or at the end of a path; a link that leads nowhere counts.
+    /// Whether `name` exists at the top level or at the end of a path. A link that leads to no object counts.
     pub fn has(&self, name: &str) -> bool {
         match name.split_once('/') {
             None => self.top.contains_key(name),
@@ -61,13 +61,13 @@ impl Names {
         }
     }
 
-    /// Every name at the top level: a group with a slash after it.
+    /// All names at the top level; group names end with a slash.
     pub fn list(&self) -> Vec<String> {
         let group = |link: &Link| matches!(link, Link::Hard(a) if matches!(self.image.links(*a), Ok(Some(_))));
         self.top.iter().map(|(name, link)| if group(link) { format!("{name}/") } else { name.clone() }).collect()
     }
 
-    /// Where `name`, or a path of names, leads. The empty name is the top level.
+    /// The object that `name`, or a path of names, leads to. The empty name is the top level.
     pub fn find(&self, name: &str) -> io::Result<Found> {
         if name.is_empty() {
             return Ok(Found::Group(self.top.keys().cloned().collect()));
@@ -81,7 +81,7 @@ impl Names {
         };
         let (mut at, mut path) = (self.root, Vec::new());
         let mut followed = 0;
-        // The parts of the path still to walk, the next one last.
+        // The parts of the path that are still to follow, in reverse order.
         let mut parts: Vec<String> = name.split('/').rev().map(str::to_owned).collect();
         while let Some(part) = parts.pop() {
             if part.is_empty() || part == "." {
@@ -127,7 +127,7 @@ impl Names {
         }
     }
 
-    /// What to show of a data set that the library does not read as it is.
+    /// The patch for a data set that the library does not read in its stored form.
     pub fn readable_layout(&self, header: u64) -> io::Result<Option<Patch>> {
         self.image.readable_layout(header)
     }

@@ -1,24 +1,24 @@
-//! Number types, and what does not survive the way to float32.
+//! Number types, and values that change when converted to float32.
 
 use hdf5_pure::{Dataset, Datatype, DatatypeByteOrder, Error, FixedPointLayout, FloatingPointLayout};
 
-/// From here on float32 skips integers.
+/// From this number on, float32 cannot represent every integer.
 const EXACT_INTEGERS: f32 = 16_777_216.0;
-/// Rows per step of a second look at the stored numbers.
+/// Rows per step when the stored numbers are checked again.
 const WINDOW: u64 = 1 << 16;
 
-/// Whether numbers of this type are read.
+/// Whether numbers of this type can be read.
 pub(super) fn is_number(datatype: &Datatype) -> bool {
     match datatype {
         Datatype::FixedPoint { size, .. } => *size <= 8,
         Datatype::FloatingPoint { size, .. } => matches!(size, 4 | 8) || half_order(datatype).is_some(),
-        // h5py's booleans are an enumeration over int8.
+        // h5py stores booleans as an enumeration over int8.
         Datatype::Enumeration { base_type, .. } => matches!(**base_type, Datatype::FixedPoint { .. }),
         _ => false,
     }
 }
 
-/// All numbers of a data set, row by row.
+/// Reads all numbers of a data set, row by row.
 pub(super) fn read_f32(dataset: &Dataset, datatype: &Datatype) -> Result<Vec<f32>, Error> {
     let Some(order) = half_order(datatype) else {
         return dataset.read_f32();
@@ -31,7 +31,7 @@ pub(super) fn read_f32(dataset: &Dataset, datatype: &Datatype) -> Result<Vec<f32
     Ok(raw.chunks_exact(2).map(|b| half_to_f32(number([b[0], b[1]]))).collect())
 }
 
-/// The byte order of IEEE float16, which the library does not read; `None` for every other type.
+/// The byte order of IEEE float16, which the library does not read; `None` for any other type.
 fn half_order(datatype: &Datatype) -> Option<DatatypeByteOrder> {
     let Datatype::FloatingPoint { size: 2, byte_order, layout } = datatype else {
         return None;
@@ -48,7 +48,7 @@ fn half_order(datatype: &Datatype) -> Option<DatatypeByteOrder> {
     (*layout == ieee && *byte_order != DatatypeByteOrder::Vax).then_some(*byte_order)
 }
 
-/// Exact: float32 holds every float16.
+/// The conversion is exact: float32 holds every float16.
 fn half_to_f32(bits: u16) -> f32 {
     let sign = u32::from(bits >> 15) << 31;
     let (exponent, mantissa) = (u32::from(bits >> 10 & 0x1f), u32::from(bits & 0x3ff));
@@ -61,7 +61,7 @@ fn half_to_f32(bits: u16) -> f32 {
     f32::from_bits(sign | magnitude)
 }
 
-/// The stored number `at` (counted row by row, `dim` a row) if it is a finite float64.
+/// The stored number `at` (counted row by row, `dim` per row) if it is a finite float64.
 pub(super) fn finite_f64(dataset: &Dataset, datatype: &Datatype, at: usize, dim: usize) -> Option<f64> {
     if !matches!(datatype, Datatype::FloatingPoint { size: 8, .. }) {
         return None;
@@ -70,13 +70,13 @@ pub(super) fn finite_f64(dataset: &Dataset, datatype: &Datatype, at: usize, dim:
     row.get(at % dim).copied().filter(|x| x.is_finite())
 }
 
-/// How many integers are not the ones stored, and the first of them: the place (counted row by row) and the number.
+/// The number of integers that differ from the stored ones; place (counted row by row) and value of the first one.
 pub(super) struct Inexact {
     pub count: usize,
     pub first: (usize, i128),
 }
 
-/// Compares the float32 numbers with the stored integers; `None` if all are the same, or no integers.
+/// Compares the float32 numbers with the stored integers; `None` if all are equal or the data set holds no integers.
 pub(super) fn inexact_integers(
     dataset: &Dataset,
     datatype: &Datatype,
@@ -86,7 +86,7 @@ pub(super) fn inexact_integers(
     let Datatype::FixedPoint { layout: FixedPointLayout { signed, .. }, size: 4..=8, .. } = datatype else {
         return Ok(None);
     };
-    // Integers up to 2^24 are exact: nearly every file ends here.
+    // Integers up to 2^24 are exact, so nearly every file returns here.
     if data.iter().all(|x| x.abs() < EXACT_INTEGERS) {
         return Ok(None);
     }

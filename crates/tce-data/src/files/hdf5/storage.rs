@@ -1,45 +1,45 @@
-//! Whether a data set's numbers are in the file, and in a form that is read: looked at before anything is allocated.
+//! Checks that a data set's numbers are in the file and in a readable form, before any memory is allocated.
 
 use hdf5_pure::{Chunk, ChunkIndex, Dataset, Error, FormatError, Layout};
 
 use super::{COPY, Hdf5, REPAIR, guard};
 use crate::{DataError, Problem};
 
-/// Deflate cannot expand by more than 1032 : 1. A data set that announces more than this times the file's size is not
-/// in the file.
+/// Deflate cannot expand by more than 1032 : 1. If a data set declares more than this times the file's size, its data
+/// cannot be in the file.
 const MAX_EXPANSION: u64 = 1040;
 
-/// What to do with a data set, or a part of one, that was created and never written.
+/// How to treat a data set, or a part of one, that was created but never written.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Unwritten {
-    /// Refuse it: states and actions made up of zeros are no data.
+    /// Return an error: states and actions made up of zeros are not data.
     Refuse,
-    /// Read it as its fill value (zero if none is given), as h5py does. Its size is in no bytes of the file, so that it
-    /// must have the rows of `observations`, which must be there.
+    /// Read it as its fill value (default: zero), as h5py does. The file's bytes do not limit its size. It must
+    /// therefore have as many rows as `observations`, which must be present.
     Fill,
 }
 
-/// What a data set says of itself.
+/// What the header says about a data set.
 struct Told<'a> {
     name: &'a str,
     shape: Vec<u64>,
-    /// Bytes of an element.
+    /// Bytes per element.
     element: u64,
-    /// Bytes of all; None above 2^64.
+    /// Declared bytes of the whole data set; `None` above 2^64.
     announced: Option<u64>,
-    /// Whether the file can hold them, compressed.
+    /// Whether the file is large enough to hold them in compressed form.
     fits: bool,
     unwritten: Unwritten,
 }
 
-/// Bytes of a box of elements; None above 2^64.
+/// Bytes of a block of elements; `None` above 2^64.
 fn bytes_of(element: u64, dims: &[u64]) -> Option<u64> {
     dims.iter().try_fold(element, |n, &d| n.checked_mul(d))
 }
 
 impl Hdf5 {
-    /// Refuses a data set that the file's bytes cannot hold, that was never (completely) written, or that is stored in a
-    /// way that is not read. Returns a note about what will be filled, if anything.
+    /// Returns an error if the file's bytes cannot hold the data set, if it was never (completely) written, or if it is
+    /// stored in an unsupported way. Otherwise returns a note about values that will be filled, if any.
     pub(super) fn ensure_stored(
         &self,
         name: &str,
@@ -52,7 +52,7 @@ impl Hdf5 {
         let told = Told { name, shape, element, announced, fits, unwritten };
         match guard(&self.path, name, || dataset.layout())? {
             Layout::Contiguous { address: None, .. } => {
-                // Data in a file of its own looks the same, except to a reader.
+                // Raw data in an external file have the same layout message; only a read shows the difference.
                 match guard(&self.path, name, || Ok(dataset.read_raw_rows(0, 1)))? {
                     Err(Error::Format(FormatError::UnsupportedExternalStorage)) => {
                         Err(self.elsewhere(name, "raw data in another file"))
@@ -74,7 +74,7 @@ impl Hdf5 {
         }
     }
 
-    /// [`Self::ensure_stored`] of a data set in chunks.
+    /// [`Self::ensure_stored`] for a chunked data set.
     fn ensure_chunks(
         &self,
         told: &Told<'_>,
@@ -88,7 +88,7 @@ impl Hdf5 {
         }
         let grid = shape.iter().zip(chunk_shape).try_fold(1u64, |n, (s, c)| n.checked_mul(s.div_ceil(*c)));
         let grid = grid.ok_or_else(|| self.oversized(name, None))?;
-        // Every stored chunk costs an address or, where the index has none, an element: the others are missing.
+        // Every stored chunk takes an address in the file or, without an index, an element. The others are missing.
         let mut note = None;
         if grid > self.bytes / element.clamp(&1, &8) {
             note = self.filled_or_refused(told, format!("most of its {grid} chunks never written"))?;
@@ -117,14 +117,14 @@ impl Hdf5 {
         if note.is_none() && !fits { Err(self.oversized(name, *announced)) } else { Ok(note) }
     }
 
-    /// More data than the file can hold.
+    /// The error for more data than the file can hold.
     fn oversized(&self, name: &str, announced: Option<u64>) -> DataError {
         let announced = announced.map_or("more than 2^64".to_owned(), |n| n.to_string());
         let found = format!("{announced} bytes announced, in a file of {} bytes", self.bytes);
         self.invalid(Problem::Oversized, name, found, "no more data than the file can hold", REPAIR)
     }
 
-    /// What is missing is filled, with a note, or refused.
+    /// Returns the note that missing data will be filled, or an error.
     fn filled_or_refused(&self, told: &Told<'_>, what: String) -> Result<Option<String>, DataError> {
         let Told { name, shape, announced, fits, unwritten, .. } = told;
         match unwritten {
@@ -152,7 +152,7 @@ impl Hdf5 {
         }
     }
 
-    /// The rows of `observations`, which must be stored.
+    /// The number of rows of `observations`, which must be stored.
     fn written_rows(&self) -> Result<u64, DataError> {
         let name = "observations";
         let dataset = self.open_dataset(name)?;
@@ -161,13 +161,13 @@ impl Hdf5 {
         Ok(shape.first().copied().unwrap_or(1))
     }
 
-    /// Refuses numbers that another file holds.
+    /// The error for data that are stored in another file.
     pub(super) fn elsewhere(&self, name: &str, found: impl Into<String>) -> DataError {
         let advice = format!("Copy the data into one file: {COPY}");
         self.invalid(Problem::Unsupported, name, found, "numbers in this very file", advice)
     }
 
-    /// Refuses compressions that are not read, unless every chunk was stored without.
+    /// Returns an error for unsupported compressions, unless every chunk was stored uncompressed.
     fn ensure_filters(&self, name: &str, dataset: &Dataset, chunks: &[Chunk]) -> Result<(), DataError> {
         for (i, filter) in dataset.filters().into_iter().enumerate() {
             let Some(unread) = unread_filter(filter) else { continue };
@@ -191,11 +191,11 @@ impl Hdf5 {
 
 struct Unread {
     name: &'static str,
-    /// Whether h5repack reads it without a plugin.
+    /// Whether h5repack reads the filter without a plugin.
     part_of_hdf5: bool,
 }
 
-/// A filter that `hdf5-pure` does not undo.
+/// Returns a filter that `hdf5-pure` cannot undo.
 fn unread_filter(id: u16) -> Option<Unread> {
     let (name, part_of_hdf5) = match id {
         // Deflate, shuffle, Fletcher-32, scale-offset, LZF.

@@ -1,9 +1,10 @@
-//! The link tables of groups, out of the file's own bytes.
+//! Reads the link tables of groups from the file's bytes.
 //!
-//! `hdf5-pure` follows hard links only: soft and external links are absent from its listings, or an error. So the names
-//! are read here: object headers (versions 1 and 2), symbol tables (old-style groups), link messages (new-style groups)
-//! and dense link storage (new-style groups of more than eight links: a fractal heap behind a version 2 B-tree).
-//! Nothing here trusts a number of the file: every read is checked against the file's length and [`super::image::MAX_READ`].
+//! `hdf5-pure` follows hard links only: it does not list soft and external links, or returns an error for them. So the
+//! names are read here: object headers (versions 1 and 2), symbol tables (old-style groups), link messages (new-style
+//! groups) and dense link storage (new-style groups of more than eight links: a fractal heap indexed by a version 2
+//! B-tree). No number in the file is trusted: every read is checked against the file's length and
+//! [`super::image::MAX_READ`].
 
 use std::collections::BTreeMap;
 use std::io::Result;
@@ -12,7 +13,7 @@ use super::heap::Heap;
 use super::image::{Fields, Image, MAX_READ, Patch, malformed};
 use super::modern::{self, lookup3};
 
-/// Nodes of one tree: bounds the work on a damaged file, whose nodes may form a circle.
+/// Most nodes of one tree. This limits the work on a damaged file, whose nodes may form a cycle.
 const MAX_NODES: usize = 100_000;
 
 const LINK_INFO: u16 = 0x02;
@@ -30,7 +31,7 @@ pub(super) enum Link {
     Soft(String),
     /// A path of another file.
     External { file: String, path: String },
-    /// A kind that only the writing program knows.
+    /// A kind of link that only the writing program knows.
     Unknown(u8),
 }
 
@@ -38,11 +39,11 @@ pub(super) enum Link {
 struct Message {
     kind: u16,
     body: Vec<u8>,
-    /// Bytes before the body: its kind first, its size next.
+    /// Bytes before the body: its kind, then its size.
     prefix: Vec<u8>,
     /// Address of the body.
     at: u64,
-    /// Address and length of what the block's checksum covers; the checksum follows. Old headers have none.
+    /// Address and length of the bytes under the block's checksum, which follows them. Old headers have none.
     checked: Option<(u64, u64)>,
 }
 
@@ -55,7 +56,7 @@ fn until_nul(bytes: &[u8]) -> Result<String> {
 }
 
 impl Image {
-    /// The links of the group whose object header is at `header`; `None` if the object is not a group.
+    /// The links of the group with the object header at `header`; `None` if the object is not a group.
     pub fn links(&self, header: u64) -> Result<Option<Links>> {
         let mut links = Links::new();
         let mut group = false;
@@ -93,8 +94,8 @@ impl Image {
         Ok(group.then_some(links))
     }
 
-    /// A data set's header with a layout message that the library reads in the place of one that it does not; `None` if
-    /// it reads the one that is there. See [`modern`](super::modern).
+    /// Patches a data set's header: replaces a layout message that the library does not read by one that it reads.
+    /// `None` if it reads the existing message. See [`modern`](super::modern).
     pub fn readable_layout(&self, header: u64) -> Result<Option<Patch>> {
         let layout = self.messages(header)?.into_iter().find(|m| m.kind == LAYOUT);
         let Some((Message { body, mut prefix, at, checked: Some((start, length)), .. }, new)) =
@@ -102,8 +103,8 @@ impl Image {
         else {
             return Ok(None);
         };
-        // The new message may be longer. So it stands in a block of its own behind the file's end, and a continuation
-        // message, which says where that is, in the place of the old one.
+        // The new message may be longer. It is therefore stored in a block of its own after the file's end, and the old
+        // message is replaced by a continuation message with its address.
         if body.len() < self.offset + self.length {
             return Ok(None);
         }
@@ -125,11 +126,11 @@ impl Image {
         Ok(Some(Patch { start: self.base + start, bytes, behind }))
     }
 
-    /// The messages of an object header that are looked at here.
+    /// The messages of an object header that are used here.
     fn messages(&self, header: u64) -> Result<Vec<Message>> {
         let start = self.read(header, 4)?;
         let modern = start == *b"OHDR";
-        // Blocks to look through: the address of their first message, the messages, what the checksum covers.
+        // Blocks still to read: address of the first message, the messages, the range under the checksum.
         let mut blocks = Vec::new();
         let mut order = false;
         if modern {
@@ -154,7 +155,7 @@ impl Image {
         while let Some((first, block, checked)) = blocks.pop() {
             let mut f = Fields(&block);
             let prefix = if modern { 4 + 2 * usize::from(order) } else { 8 };
-            // What is shorter than a message is a gap.
+            // A remainder shorter than a message is a gap.
             while f.0.len() >= prefix {
                 let before = f.take(prefix)?;
                 let mut head = Fields(before);
@@ -184,7 +185,7 @@ impl Image {
         Ok(messages)
     }
 
-    /// One link message.
+    /// Reads one link message.
     fn link(&self, message: &[u8]) -> Result<(String, Link)> {
         let mut f = Fields(message);
         let version = f.byte()?;
@@ -210,7 +211,7 @@ impl Image {
             64 => {
                 let length = f.uint(2)? as usize;
                 let value = f.take(length)?;
-                // A byte of version and flags, then two texts.
+                // One byte of version and flags, then two strings.
                 let value = value.get(1..).unwrap_or_default();
                 let file = until_nul(value)?;
                 let rest = value.iter().position(|&b| b == 0).map_or(&[][..], |end| &value[end + 1..]);
@@ -221,7 +222,7 @@ impl Image {
         Ok((name, link))
     }
 
-    /// An old-style group: a tree of nodes of entries, with the texts in a heap.
+    /// Reads an old-style group: a tree whose nodes hold entries, with the names in a heap.
     fn symbol_table(&self, tree: u64, heap: u64, links: &mut Links) -> Result<()> {
         let header = self.read(heap, 8 + 2 * self.length as u64 + self.offset as u64)?;
         let mut f = Fields(&header);
@@ -230,7 +231,7 @@ impl Image {
         let size = f.uint(self.length)?;
         f.take(self.length)?;
         let segment = self.read(f.uint(self.offset)?, size)?;
-        // Texts may not overlap in a valid file, so that all of them together are no longer than the heap.
+        // In a valid file names do not overlap, so their total length is at most that of the heap.
         let mut left = segment.len();
         let mut text = |at: u64| -> Result<String> {
             let rest = usize::try_from(at).ok().and_then(|at| segment.get(at..));
@@ -264,14 +265,14 @@ impl Image {
             let mut f = Fields(&block[prefix as usize..]);
             for _ in 0..entries {
                 f.take(self.length)?;
-                // Level 0 of the tree points to nodes of entries: one level further down.
+                // Level 0 of the tree points to nodes of entries, one level further down.
                 nodes.push((f.uint(self.offset)?, Some(own)));
             }
         }
         Ok(())
     }
 
-    /// One node of entries of an old-style group.
+    /// Reads one node of entries of an old-style group.
     fn symbols(&self, address: u64, text: &mut impl FnMut(u64) -> Result<String>, links: &mut Links) -> Result<()> {
         let head = self.read(address, 8)?;
         let mut f = Fields(&head);
@@ -287,7 +288,7 @@ impl Image {
             let cached = f.uint(4)?;
             f.take(4)?;
             let scratch = f.take(16)?;
-            // 2: a soft link, its text's place in the heap in the scratch space.
+            // 2: a soft link. The scratch space holds the position of its path in the heap.
             let link = if cached == 2 { Link::Soft(text(Fields(scratch).uint(4)?)?) } else { Link::Hard(object) };
             links.insert(name, link);
         }

@@ -1,4 +1,4 @@
-//! Files as other programs write them.
+//! Test files in the form that other programs write.
 #![allow(dead_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -32,8 +32,8 @@ pub fn rows(n: usize) -> Rows {
     }
 }
 
-/// As [`rows`], in episodes of these lengths: each begins 1000 further on than the one before it ended, and every s' is the next
-/// row's state, whosever it is.
+/// Like [`rows`], in episodes of these lengths. Each begins 1000 higher than the one before it ended, and every s' is
+/// the next row's state, even across episodes.
 pub fn rebuilt(lengths: &[usize]) -> Rows {
     let n = lengths.iter().sum();
     let episode = lengths.iter().enumerate().flat_map(|(k, &length)| std::iter::repeat_n(k, length));
@@ -71,7 +71,7 @@ impl Rows {
         b
     }
 
-    /// OTDF's medium and expert files: (N, 1), f64 terminals, a metadata group, small gzip chunks.
+    /// As in OTDF's medium and expert files: (N, 1), f64 terminals, a metadata group, small gzip chunks.
     pub fn otdf(&self) -> FileBuilder {
         let n = self.len();
         let mut b = FileBuilder::new();
@@ -101,7 +101,7 @@ pub fn load(path: &Path) -> Result<Loaded, DataError> {
     tce_data::load(path, &benchmark())
 }
 
-/// What is known of a benchmark robot's file.
+/// The options for a file of a benchmark robot.
 pub fn benchmark() -> LoadOptions {
     LoadOptions { step_limit: Some(1000), ..LoadOptions::default() }
 }
@@ -116,7 +116,7 @@ pub fn assert_refused(error: DataError, problem: Problem, path: &Path, field: &s
     }
 }
 
-/// `n` rows of plausible numbers in the given dimensions, with an end every `length` rows.
+/// `n` rows of plausible numbers in the given dimensions. An episode ends every `length` rows.
 pub fn synthetic(n: usize, obs_dim: usize, act_dim: usize, length: usize) -> Transitions {
     use rand::RngExt;
     let mut rng = tce_base::Streams::new(7).stream("synthetic");
@@ -134,7 +134,7 @@ pub fn synthetic(n: usize, obs_dim: usize, act_dim: usize, length: usize) -> Tra
     }
 }
 
-/// The shared folder with the public files, if there is one.
+/// The shared folder with the public files, if it exists.
 pub fn shared() -> Option<PathBuf> {
     let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
     let path = std::env::var_os("TCE_SHARED").map_or(default, PathBuf::from);
@@ -155,10 +155,10 @@ pub fn python(script: &str, argument: &Path) -> Option<String> {
     Some(String::from_utf8(out.stdout).unwrap())
 }
 
-/// The Python of a virtual environment under `target/` with `packages`, which `imports` come from, made when missing; `Err` says why
-/// there is none.
+/// The Python of a virtual environment under `target/` with `packages`, which provide `imports`. It is created if
+/// missing; `Err` says why there is none.
 ///
-/// Made beside its place and moved there whole, so that test processes that run side by side cannot see half of one.
+/// It is built in a temporary folder and moved as a whole, so that parallel test processes see no partial one.
 pub fn environment(name: &str, packages: &[&str], imports: &str) -> Result<PathBuf, String> {
     let root = Path::new(env!("CARGO_TARGET_TMPDIR"));
     let place = root.join(name);
@@ -182,14 +182,14 @@ pub fn environment(name: &str, packages: &[&str], imports: &str) -> Result<PathB
     let making = tempfile::Builder::new().prefix(name).tempdir_in(root).map_err(|e| e.to_string())?;
     let base = std::env::var("TCE_PYTHON").unwrap_or_else(|_| "python3".into());
     run(Command::new(base).args(["-m", "venv"]).arg(making.path()))?;
-    // Wheels only: building h5py from source takes minutes and HDF5's headers.
+    // Wheels only: building h5py from source takes minutes and needs HDF5's headers.
     let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"];
     let patience = ["--retries", "1", "--timeout", "15"];
     run(Command::new(python(making.path())).args(pip).args(patience).args(packages))?;
     if !works(making.path()) {
         return Err(format!("{name} was installed, and cannot be imported"));
     }
-    // Another process may have been faster, or one that does not work is in the way.
+    // Another process may have been faster, or a broken environment may be in the way.
     if fs::rename(making.path(), &place).is_err() && !works(&place) {
         fs::remove_dir_all(&place).map_err(|e| e.to_string())?;
         fs::rename(making.path(), &place).map_err(|e| e.to_string())?;
@@ -200,12 +200,12 @@ pub fn environment(name: &str, packages: &[&str], imports: &str) -> Result<PathB
 #[global_allocator]
 static ALLOCATOR: Largest = Largest;
 
-/// Notes the largest single allocation.
+/// Records the largest single allocation.
 pub struct Largest;
 
 pub static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
-// SAFETY: everything is passed on to the system's allocator unchanged.
+// SAFETY: all calls are passed on to the system's allocator unchanged.
 unsafe impl GlobalAlloc for Largest {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Relaxed);
