@@ -1,4 +1,4 @@
-//! Policies in the simulator: collecting data sets with them and scoring them.
+//! Runs policies in the simulator: collects data sets with them and evaluates them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,30 +14,30 @@ use crate::error::{Error, Result};
 use crate::exhibits::Exhibit;
 use crate::recipes::Recipe;
 
-/// Which of a stochastic policy's actions are taken.
+/// Which actions of a stochastic policy are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Actions {
-    /// The mean one.
+    /// The mean action.
     Mean,
-    /// Sampled ones.
+    /// Sampled actions.
     Sampled,
 }
 
 impl Actions {
-    /// Mean or sampled ones.
+    /// `Mean` if `mean`, otherwise `Sampled`.
     pub fn mean_if(mean: bool) -> Self {
         if mean { Self::Mean } else { Self::Sampled }
     }
 }
 
-/// A policy as the simulator wants it.
+/// A policy as an actor for the simulator.
 pub struct PolicyActor {
     policy: Policy,
     chosen: Actions,
 }
 
 impl PolicyActor {
-    /// Acts by the mean action, or by sampled ones.
+    /// Acts with the mean action or with sampled ones.
     pub fn new(policy: Policy, chosen: Actions) -> Self {
         Self { policy, chosen }
     }
@@ -59,10 +59,10 @@ impl Actor for PolicyActor {
     }
 }
 
-/// Reads a policy, from a file or as `zoo:NAME`.
+/// Reads a policy from a file or from the zoo (`zoo:NAME`).
 ///
 /// # Errors
-/// If there is none, or it is damaged.
+/// If there is no such policy or its file is damaged.
 pub fn read_policy(path: &Path) -> Result<Policy> {
     match Exhibit::at(path)? {
         Some(exhibit) => exhibit.policy(),
@@ -70,10 +70,10 @@ pub fn read_policy(path: &Path) -> Result<Policy> {
     }
 }
 
-/// [`read_policy`], of one for `agent`.
+/// [`read_policy`] for a policy that must fit `agent`.
 ///
 /// # Errors
-/// As there, and if it has other dimensions.
+/// As [`read_policy`], and if the policy has other dimensions.
 pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
     let policy = read_policy(path)?;
     let (found, expected) = (policy.dims(), agent.dims());
@@ -91,7 +91,7 @@ pub fn load_policy(path: &Path, agent: Agent) -> Result<Policy> {
 }
 
 impl Recipe {
-    /// Rolls the actors out.
+    /// Collects the rows by rolling out the actors.
     pub fn collect(&self) -> Result<Transitions> {
         let (obs_dim, act_dim) = self.agent.dims();
         let total: f64 = self.parts.iter().map(|p| p.weight).sum();
@@ -104,7 +104,7 @@ impl Recipe {
         let mut out = Transitions::with_capacity(obs_dim, act_dim, self.rows);
         let mut before = 0.0;
         for (k, (part, policy)) in self.parts.iter().zip(policies).enumerate() {
-            // Rounding the running sum keeps the total exact.
+            // Rounding of the running sum keeps the total exact.
             let from = (self.rows as f64 * before / total).round() as usize;
             before += part.weight;
             let to = (self.rows as f64 * before / total).round() as usize;
@@ -117,7 +117,7 @@ impl Recipe {
         Ok(out)
     }
 
-    /// What goes into the file beside the rows.
+    /// Attributes that are written to the file with the rows.
     pub fn attributes(&self) -> Result<BTreeMap<String, String>> {
         let mut attributes = BTreeMap::new();
         attributes.insert("recipe".to_owned(), serde_json::to_string(self).expect("plain data"));
@@ -134,14 +134,14 @@ impl Recipe {
         Ok(attributes)
     }
 
-    /// The file of this recipe in `directory`, collected now unless it is there.
+    /// The file of this recipe in `directory`. If it does not exist, the rows are collected now.
     pub fn cached(&self, directory: &Path, name: &str) -> Result<PathBuf> {
         cached(directory, name, &self.attributes()?, || self.collect())
     }
 }
 
-/// The file in `directory` with the rows that `attributes` describe, written now by `make` unless it is there: its name is `name` and the
-/// start of their hash.
+/// The file in `directory` with the rows that `attributes` describe. If it does not exist, `make` produces the rows
+/// now. The file name is `name` and the start of the hash of `attributes`.
 pub fn cached(
     directory: &Path,
     name: &str,
@@ -160,16 +160,16 @@ pub fn cached(
     Ok(path)
 }
 
-/// Returns of some episodes.
+/// The results of some episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     /// Undiscounted return of every episode.
     pub returns: Vec<f64>,
     /// Steps of every episode.
     pub lengths: Vec<usize>,
-    /// 100 (J - J_r) / (J_e - J_r) of the mean return, where references are known.
+    /// 100 (J - J_r) / (J_e - J_r) of the mean return J, if reference returns are known.
     pub score: Option<f64>,
-    /// Why there are no episodes, if there are none.
+    /// Why there are no episodes, if the evaluation failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failed: Option<String>,
 }
@@ -182,12 +182,12 @@ impl Evaluation {
         Self { lengths: results.iter().map(|r| r.length).collect(), returns, score, failed: None }
     }
 
-    /// That of a policy that cannot act, and why.
+    /// The evaluation of a policy that cannot act, with the reason.
     pub fn failed(why: String) -> Self {
         Self { returns: Vec::new(), lengths: Vec::new(), score: None, failed: Some(why) }
     }
 
-    /// Mean of the episodes' lengths.
+    /// Mean length of the episodes.
     pub fn mean_length(&self) -> f64 {
         self.lengths.iter().sum::<usize>() as f64 / self.lengths.len() as f64
     }
@@ -200,19 +200,19 @@ pub struct Arena {
     pub agent: Agent,
     /// The domain.
     pub shift: Shift,
-    /// Returns that stand for 0 and 100.
+    /// Returns with scores 0 and 100.
     pub reference: Option<ReferenceScores>,
 }
 
 impl Arena {
-    /// With the references of `table`, where it has any.
+    /// Uses the reference returns of `table`, if it has any.
     pub fn new(agent: Agent, shift: Shift, table: ScoreTable) -> Self {
         Self { agent, shift, reference: reference_scores(agent, shift, table) }
     }
 }
 
-/// Rolls `policy` out for `episodes` episodes, by mean or sampled `actions`, unless `stop` says so:
-/// [`tce_base::interrupted`] where the user may end it.
+/// Evaluates `policy` over `episodes` episodes with mean or sampled `actions`. Stops when `stop` returns true; pass
+/// [`tce_base::interrupted`] to let the user stop it.
 pub fn evaluate(
     policy: &Policy,
     arena: Arena,

@@ -1,9 +1,9 @@
-//! Why an actor cannot be trained, loaded or used.
+//! Errors when an actor is trained, loaded or used.
 
-/// Any reason for which there is no actor, or no rows of it.
+/// Any reason why there is no actor, or why it has no rows.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// What was asked for makes no sense.
+    /// The request is invalid.
     #[error("{0}")]
     Usage(String),
     /// A data set cannot be read or written.
@@ -15,16 +15,16 @@ pub enum Error {
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] tce_base::FileError),
-    /// A file of parameters is not usable.
+    /// A parameter file cannot be used.
     #[error(transparent)]
     Network(#[from] tce_nn::NetworkError),
-    /// A policy file is not usable.
+    /// A policy file cannot be used.
     #[error(transparent)]
     Learn(#[from] tce_learn::LearnError),
-    /// A file is not what it should be, or a training diverged.
+    /// A file has the wrong content, or a training run diverged.
     #[error("{0}")]
     Failed(String),
 }
 
-/// The result of what this crate does.
+/// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

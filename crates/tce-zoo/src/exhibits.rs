@@ -1,8 +1,9 @@
-//! The zoo: actors that this very program trained, by SAC or by cloning, shipped inside it, with a card each.
+//! The zoo: actors trained by this program itself, by SAC or by cloning, and built into it, each with a card.
 //!
-//! An actor is a safetensors file in half precision under `crates/tce-zoo/zoo`, named `AGENT-SHIFT-ROLE`. Wherever a policy's file is
-//! asked for, `zoo:NAME` stands for one of them. Roles are `medium` and `expert` (D4RL's returns in the source domain, OTDF's
-//! in the others) and `stage-N`, an earlier policy of the training that led to `medium`, at a score of about N.
+//! An actor is a safetensors file in half precision under `crates/tce-zoo/zoo`, named `AGENT-SHIFT-ROLE`. Wherever a
+//! policy file is expected, `zoo:NAME` can be used for one of them. Roles are `medium` and `expert` (D4RL's returns in
+//! the source domain, OTDF's in the others) and `stage-N`, an earlier policy of the run that led to `medium`, at a
+//! score of about N.
 
 use std::path::{Path, PathBuf};
 
@@ -21,30 +22,30 @@ static FILES: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/zoo");
 /// Key of the card in a policy file's metadata.
 const CARD: &str = "card";
 
-/// What a policy's file says about where it comes from.
+/// The origin of a policy, stored in its file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Card {
     /// The robot.
     pub agent: Agent,
-    /// The domain it was trained in.
+    /// The domain in which it was trained.
     pub shift: Shift,
-    /// What it is in the zoo for.
+    /// Its role in the zoo.
     #[serde(default)]
     pub role: Option<String>,
-    /// Of the training.
+    /// The seed of the training run.
     pub seed: u64,
-    /// Environment steps of the training until then.
+    /// Environment steps of the training run up to this policy.
     pub steps: u64,
-    /// Updates until then.
+    /// Updates up to this policy.
     pub updates: u64,
     /// Rows per update.
     pub batch: usize,
-    /// The training whose networks this one began with.
+    /// The training run whose networks this one started from.
     pub from: Option<String>,
-    /// The rows whose behaviour it was cloned from; none for SAC.
+    /// The rows from which it was cloned; `None` for SAC.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cloned_from: Option<String>,
-    /// Episodes with sampled actions behind the next metrics.
+    /// Number of episodes with sampled actions in the metrics below.
     pub episodes: usize,
     /// Mean return.
     pub mean: f64,
@@ -52,14 +53,14 @@ pub struct Card {
     pub std: f64,
     /// Mean length.
     pub length: f64,
-    /// Normalised score of the mean return; none where nobody publishes references.
+    /// Normalised score of the mean return; `None` if no reference returns are published.
     pub score: Option<f64>,
     /// The program that trained it.
     pub program: String,
 }
 
 impl Card {
-    /// The card of a clone of the rows that `cloned_from` describes, before anyone has evaluated it.
+    /// The card of a policy cloned from the rows that `cloned_from` describes, before it has been evaluated.
     pub fn of_clone(agent: Agent, shift: Shift, cloned_from: String, seed: u64, updates: u64, batch: usize) -> Self {
         Self {
             agent,
@@ -83,19 +84,19 @@ impl Card {
     /// The card in a policy file, if it has one.
     ///
     /// # Errors
-    /// If it cannot be read.
+    /// If the card cannot be read.
     pub fn of(parameters: &NamedParameters, path: &Path) -> Result<Option<Self>> {
         let Some(text) = parameters.metadata.get(CARD) else { return Ok(None) };
         let card = serde_json::from_str(text);
         card.map(Some).map_err(|e| Error::Failed(format!("{}: field 'card': {e}", path.display())))
     }
 
-    /// Puts the card into a policy's parameters.
+    /// Adds the card to a policy's parameters.
     pub fn attach(&self, parameters: &mut NamedParameters) {
         parameters.metadata.insert(CARD.into(), serde_json::to_string(self).expect("plain data"));
     }
 
-    /// The name in the zoo.
+    /// The policy's name in the zoo.
     pub fn name(&self) -> Option<String> {
         Some(format!("{}-{}-{}", self.agent, self.shift, self.role.as_ref()?))
     }
@@ -110,7 +111,7 @@ pub struct Exhibit {
 }
 
 impl Exhibit {
-    /// All of them, by name.
+    /// All actors of the zoo, sorted by name.
     pub fn all() -> Vec<Self> {
         let files = FILES.files().filter(|f| f.path().extension().is_some_and(|e| e == "safetensors"));
         let name = |f: &include_dir::File<'static>| f.path().file_stem().and_then(|s| s.to_str()).expect("plain names");
@@ -119,10 +120,10 @@ impl Exhibit {
         all
     }
 
-    /// The one called `name`.
+    /// The actor called `name`.
     ///
     /// # Errors
-    /// If there is none; the message names the one that is most like it.
+    /// If there is none; the message suggests the most similar name.
     pub fn find(name: &str) -> Result<Self> {
         let all = Self::all();
         all.iter().find(|e| e.name == name).copied().ok_or_else(|| {
@@ -131,50 +132,50 @@ impl Exhibit {
         })
     }
 
-    /// The one that a path of the form `zoo:NAME` stands for; none for any other path.
+    /// The actor that a path of the form `zoo:NAME` refers to; `None` for any other path.
     ///
     /// # Errors
-    /// If the zoo has none of that name.
+    /// If the zoo has no actor of that name.
     pub fn at(path: &Path) -> Result<Option<Self>> {
         path.to_str().and_then(|p| p.strip_prefix("zoo:")).map(Self::find).transpose()
     }
 
-    /// The path that stands for it.
+    /// The path `zoo:NAME` that refers to it.
     pub fn path(&self) -> PathBuf {
         PathBuf::from(format!("zoo:{}", self.name))
     }
 
-    /// SHA-256 of its file.
+    /// SHA-256 of the actor's file.
     pub fn sha256(&self) -> String {
         sha256_hex(self.bytes)
     }
 
-    /// Bytes of its file.
+    /// Size of the actor's file in bytes.
     pub fn size(&self) -> usize {
         self.bytes.len()
     }
 
-    /// Its weights and metadata.
+    /// The actor's weights and metadata.
     pub fn parameters(&self) -> Result<NamedParameters> {
         Ok(NamedParameters::from_bytes(self.bytes, &self.path())?)
     }
 
-    /// Ready to act.
+    /// The policy, ready to act.
     pub fn policy(&self) -> Result<Policy> {
         Ok(Policy::from_parameters(&self.parameters()?, &self.path())?)
     }
 
-    /// Where it comes from, and what it does.
+    /// The actor's origin and its results.
     pub fn card(&self) -> Result<Card> {
         let card = Card::of(&self.parameters()?, &self.path())?;
         card.ok_or_else(|| Error::Failed(format!("{}: has no card", self.path().display())))
     }
 }
 
-/// The actors of one robot in one domain. A part that the zoo lacks is empty.
+/// The actors of one robot in one domain. A part that the zoo does not have is empty.
 ///
-/// In the replay mixture an actor stands for the training steps that are nearer to its own than to the other stages', so
-/// that the mixture's shares are those of a replay buffer filled until the medium level.
+/// In the replay mixture, an actor represents the training steps that are closer to its own step than to those of the
+/// other stages. So the shares of the mixture are those of a replay buffer filled until the medium level.
 pub fn cast(agent: Agent, shift: Shift) -> Result<Cast> {
     let mut found = Vec::new();
     for exhibit in Exhibit::all() {
@@ -199,7 +200,7 @@ pub fn cast(agent: Agent, shift: Shift) -> Result<Cast> {
     Ok(Cast { medium, expert, replay })
 }
 
-/// The training steps up to the last stage that each of `steps` (ascending) is nearest to.
+/// For each of `steps` (ascending): the number of training steps, up to the last stage, that are nearest to it.
 fn shares(steps: &[u64]) -> Vec<f64> {
     let middle = |k: usize| (steps[k] + steps[k + 1]) as f64 / 2.0;
     let last = steps.len() - 1;

@@ -1,5 +1,5 @@
-//! Actors and the rows that they collect: soft actor-critic in the simulator, the policies that come with the program, and recipes
-//! of data sets.
+//! Actors and the rows that they collect: soft actor-critic (SAC) in the simulator, the policies built into the
+//! program, and recipes of data sets.
 
 pub mod actors;
 mod error;

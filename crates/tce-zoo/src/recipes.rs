@@ -5,31 +5,31 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Quality, Shift};
 
-/// One actor's part in a data set.
+/// One actor's part of a data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Part {
     /// The policy's file, or `zoo:NAME`.
     pub actor: PathBuf,
-    /// Its share of the rows, relative to the other parts'.
+    /// Its share of the rows, relative to the shares of the other parts.
     pub weight: f64,
 }
 
-/// How a data set is collected; equal recipes give equal bytes.
+/// How a data set is collected. Equal recipes give identical bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Recipe {
     /// The robot.
     pub agent: Agent,
     /// The domain.
     pub shift: Shift,
-    /// One after the other, as D4RL's medium-expert is medium, then expert.
+    /// The parts, collected one after the other: D4RL's medium-expert is medium, then expert.
     pub parts: Vec<Part>,
-    /// Rows in all.
+    /// Total number of rows.
     pub rows: usize,
-    /// Mean instead of sampled actions.
+    /// Whether mean actions are taken instead of sampled ones.
     pub mean: bool,
-    /// Environments in lockstep.
+    /// Number of environments in lockstep.
     pub lanes: usize,
-    /// The seed of everything random in it.
+    /// The seed of all random numbers.
     pub seed: u64,
 }
 
@@ -40,7 +40,7 @@ pub struct Cast {
     pub medium: Vec<Part>,
     /// D4RL's expert behaviour.
     pub expert: Vec<Part>,
-    /// The policies of a training until the medium level.
+    /// The policies of a training run up to the medium level.
     pub replay: Vec<Part>,
 }
 
@@ -48,14 +48,14 @@ pub struct Cast {
 pub const TARGET_ROWS: usize = 5000;
 
 impl Cast {
-    /// D4RL's source data of this quality, `rows` for medium or expert: twice as many for both one after the other, and for a replay
-    /// buffer the share that D4RL's have. None if an actor is missing.
+    /// D4RL's source data of this quality: `rows` for medium or expert, twice as many for medium-expert, and for a
+    /// replay buffer the same share as in D4RL. `None` if an actor is missing.
     pub fn source(self, agent: Agent, shift: Shift, quality: Quality, rows: usize, seed: u64) -> Option<Recipe> {
         let rows = match quality {
             Quality::Medium | Quality::Expert => rows,
             Quality::MediumExpert => 2 * rows,
             Quality::MediumReplay => {
-                // D4RL's buffers hold 202k, 402k, 302k and 302k rows beside 1M of medium.
+                // D4RL's replay buffers hold 202k, 402k, 302k and 302k rows for 1M rows of medium data.
                 let share = match agent {
                     Agent::HalfCheetah => 0.202,
                     Agent::Hopper => 0.402,
@@ -68,13 +68,13 @@ impl Cast {
         Some(Recipe { agent, shift, parts, rows, mean: false, lanes: 32, seed })
     }
 
-    /// A target set as OTDF's are: [`TARGET_ROWS`] rows of whole episodes but the last; medium-expert is two parts of medium to
-    /// three of expert, and its successors are the real ones. None if an actor is missing.
+    /// A target set like OTDF's: [`TARGET_ROWS`] rows of whole episodes, except that the last is cut. Medium-expert is
+    /// two parts of medium and three of expert, and its successors are the real ones. `None` if an actor is missing.
     pub fn target(self, agent: Agent, shift: Shift, quality: Quality, seed: u64) -> Option<Recipe> {
         let parts = self.parts(quality, [0.4, 0.6])?;
-        // Another seed than the source's, or both sets would begin with the same noise.
+        // The seed differs from the source's; otherwise both sets would begin with the same noise.
         let seed = seed ^ u64::from_le_bytes(*b"target\0\0");
-        // One lane: many would each cut an episode.
+        // One lane only: with more, each lane would cut an episode.
         Some(Recipe { agent, shift, parts, rows: TARGET_ROWS, mean: false, lanes: 1, seed })
     }
 

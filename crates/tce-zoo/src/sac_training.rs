@@ -1,18 +1,18 @@
-//! Agents that act and learn: SAC in an environment, at D4RL's specification, in pieces of hours.
+//! Trains SAC agents in an environment with D4RL's settings. A training run can be stopped and resumed.
 //!
-//! Environment steps and updates in turns (by default one to one); the first steps are uniformly random, or those of the
-//! policy that a training begins with. Everything random is indexed by step, update or episode, and a checkpoint is taken
-//! between episodes, so that a training that was stopped goes on to the same bytes. A step of the simulator takes .06 to .25 ms,
-//! an update of 256 rows 10 ms: what keeps the cores busy is trainings side by side, not a step beside its update.
-//! A directory holds
+//! Environment steps and updates alternate (by default one to one). The first steps are uniformly random, or come from
+//! the policy that the training run starts from. All random numbers are indexed by step, update or episode, and
+//! checkpoints are written between episodes. A resumed run therefore gives the same bytes as an uninterrupted one. A
+//! step of the simulator takes .06 to .25 ms, an update of 256 rows 10 ms. Parallel runs keep the cores busy;
+//! overlapping a step with its update does not. A directory contains
 //!
 //! | file | content |
 //! |---|---|
-//! | `settings.json` | what decides the training |
-//! | `metrics.jsonl`, `tensorboard/` | losses and evaluations; cut back to the checkpoint when the training goes on |
+//! | `settings.json` | all settings that determine the run |
+//! | `metrics.jsonl`, `tensorboard/` | losses and evaluations; cut back to the checkpoint when the run is resumed |
 //! | `replay-STEP.hdf5`, `learner-STEP.safetensors` | the last checkpoint's replay buffer and networks |
-//! | `ledger.json` | the checkpoint: step, episode, evaluations, snapshots, and the SHA-256 of the two; written last |
-//! | `previous.json` | the ledger of the checkpoint before, whose files are kept, too: for a file that goes bad |
+//! | `ledger.json` | the checkpoint: step, episode, evaluations, snapshots, and SHA-256 of both files; written last |
+//! | `previous.json` | the ledger of the checkpoint before; its files are kept as a backup if a file is damaged |
 //! | `policy-SCORE.safetensors`, `policy.safetensors` | snapshots, and the policy of the last evaluation, each with a card |
 
 use std::path::{Path, PathBuf};
@@ -34,26 +34,26 @@ use crate::actors::{Actions, Arena, Evaluation, evaluate, load_policy};
 use crate::error::{Error, Result};
 use crate::exhibits::{Card, Exhibit};
 
-/// What decides a training. Its end may be moved when it goes on.
+/// All settings that determine a training run. Its goal may change when it is resumed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     /// The robot.
     pub agent: Agent,
     /// The domain.
     pub shift: Shift,
-    /// Of everything random.
+    /// The seed of all random numbers.
     pub seed: u64,
-    /// Steps before the first update: uniformly random ones, where the networks are new.
+    /// Steps before the first update. They are uniformly random if the networks are new.
     pub start: u64,
     /// Environment steps per update.
     pub steps_per_update: u64,
-    /// Share of uniformly random actions until the policy's first update, where it is not a new one: critics learn from them what other
-    /// actions than its own do.
+    /// Share of uniformly random actions until the policy's first update, if the policy is not new. They show the
+    /// critics the effects of actions other than the policy's own.
     #[serde(default, skip_serializing_if = "no_exploration")]
     pub explore: f64,
     /// Rows per update.
     pub batch: usize,
-    /// What it began with, if not with new networks.
+    /// The networks that it started from, if they are not new.
     pub from: Option<Origin>,
     /// Steps between evaluations.
     pub evaluate_every: u64,
@@ -67,14 +67,14 @@ fn no_exploration(share: &f64) -> bool {
     *share == 0.0
 }
 
-/// When a training ends, and what it leaves on the way.
+/// When a training run ends, and which policies it keeps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Goal {
-    /// Environment steps in all.
+    /// Total number of environment steps.
     pub steps: u64,
-    /// Ends at the first evaluation with this score.
+    /// Stop at the first evaluation with this score.
     pub until: Option<f64>,
-    /// Keeps the policy of the first evaluation at or above each of these scores.
+    /// Keep the policy of the first evaluation at or above each of these scores.
     pub snapshots: Vec<f64>,
     /// Steps between checkpoints.
     pub checkpoint_every: u64,
@@ -83,7 +83,7 @@ pub struct Goal {
 /// The mean return of an evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationSummary {
-    /// Environment steps before it.
+    /// Environment steps before the evaluation.
     pub step: u64,
     /// Mean return.
     pub mean: f64,
@@ -91,23 +91,23 @@ pub struct EvaluationSummary {
     pub std: f64,
     /// Mean length of the episodes.
     pub length: f64,
-    /// Normalised; in the source domain by D4RL's references. None where nobody publishes references.
+    /// Normalised score (source domain: D4RL's reference returns). `None` if no reference returns are published.
     pub score: Option<f64>,
 }
 
 /// A policy that was kept.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
-    /// The score that it was kept for.
+    /// The score for which it was kept.
     pub at: f64,
-    /// How it did then.
+    /// Its evaluation at that time.
     #[serde(alias = "judged")]
     pub evaluation: EvaluationSummary,
     /// Its file in the directory.
     pub file: String,
 }
 
-/// How far a training is.
+/// The progress of a training run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ledger {
     /// Environment steps taken.
@@ -126,18 +126,18 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// The ledger of the training in `directory`, if it has a checkpoint.
+    /// The ledger of the training run in `directory`, if it has a checkpoint.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the ledger is damaged.
     pub fn read(directory: &Path) -> Result<Option<Self>> {
         read_json(&directory.join("ledger.json"))
     }
 
-    /// The newer one of the two checkpoints in `directory` that is whole, if there is any.
+    /// The newest undamaged one of the two checkpoints in `directory`, if there is a checkpoint.
     ///
     /// # Errors
-    /// If there are checkpoints, and none of them is whole.
+    /// If there are checkpoints, but all of them are damaged.
     fn newest_whole(directory: &Path) -> Result<Option<Self>> {
         let whole = |name: &str| -> Result<Option<Self>> {
             let ledger: Option<Self> = read_json(&directory.join(name))?;
@@ -160,13 +160,13 @@ impl Ledger {
     }
 }
 
-/// The content of a JSON file; none if there is no such file.
+/// The content of a JSON file; `None` if there is no such file.
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let bytes = read_if_there(path)?;
     bytes.map(|bytes| serde_json::from_slice(&bytes).map_err(|e| damaged(path, &e))).transpose()
 }
 
-/// Two programs in one directory would delete each other's checkpoints.
+/// Locks the directory: two programs in one directory would delete each other's checkpoints.
 fn lock(directory: &Path) -> Result<std::fs::File> {
     let path = directory.join("lock");
     let file = std::fs::File::create(&path).map_err(|e| FileError::new(&path, "create", e))?;
@@ -176,22 +176,22 @@ fn lock(directory: &Path) -> Result<std::fs::File> {
             "{}: another training is at work there; let it finish, or give another --out",
             directory.display()
         ))),
-        // Some network file systems have no locks.
+        // Some network file systems do not support locks.
         Err(std::fs::TryLockError::Error(_)) => Ok(file),
     }
 }
 
-/// What a training began with, if not with networks of its own.
+/// What a training run started from, if not from new networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Origin {
-    /// All networks of another training.
+    /// All networks of another training run.
     Training {
-        /// Where it was.
+        /// The directory of that run.
         directory: PathBuf,
         /// `hopper-source seed 0, step 300000`.
         training: String,
-        /// The file of its networks there.
+        /// The file with its networks in that directory.
         file: String,
         /// SHA-256 of that file.
         sha256: String,
@@ -206,7 +206,7 @@ pub enum Origin {
 }
 
 impl Origin {
-    /// Of a training's directory, a policy's file or `zoo:NAME`.
+    /// The origin for a training run's directory, a policy file or `zoo:NAME`.
     fn of(path: &Path, agent: Agent) -> Result<Self> {
         if let Some(exhibit) = Exhibit::at(path)? {
             return Ok(Self::Actor { actor: path.to_owned(), sha256: exhibit.sha256() });
@@ -230,14 +230,14 @@ impl Origin {
         Ok(Self::Training { directory: path.to_owned(), training, file, sha256 })
     }
 
-    /// What the user named.
+    /// The path that the user gave.
     fn path(&self) -> &Path {
         match self {
             Self::Training { directory: path, .. } | Self::Actor { actor: path, .. } => path,
         }
     }
 
-    /// For a card.
+    /// The text for a card.
     fn describe(&self) -> String {
         match self {
             Self::Training { training, .. } => training.clone(),
@@ -245,7 +245,7 @@ impl Origin {
         }
     }
 
-    /// Puts it into the networks of a training that begins.
+    /// Copies the networks into a training run that starts.
     fn start(&self, sac: &mut Sac, agent: Agent) -> Result<()> {
         match self {
             Self::Training { directory, file, sha256, .. } => {
@@ -273,7 +273,7 @@ fn verify(path: &Path, hash: &str) -> Result<()> {
     Err(Error::Failed(format!("{}: not what the ledger says; the file was changed", path.display())))
 }
 
-/// A training under way.
+/// A training run in progress.
 pub struct Training {
     settings: Settings,
     goal: Goal,
@@ -283,23 +283,23 @@ pub struct Training {
     sac: Sac,
     buffer: Buffer,
     env: Env,
-    /// The observation, and steps of the present episode.
+    /// The current observation, and the steps of the current episode.
     observation: Vec<f32>,
     length: usize,
     metrics: Metrics,
     progress: Progress,
     finished: bool,
-    /// Held as long as the training is open.
+    /// Held while the training run is open.
     #[allow(dead_code)]
     lock: std::fs::File,
 }
 
 impl Training {
-    /// Starts in `directory`, with the networks of the training or policy `from` if there is one, or goes on from the checkpoint
-    /// there.
+    /// Starts a training run in `directory`, with the networks of the run or policy `from` if given, or resumes it from
+    /// its checkpoint.
     ///
     /// # Errors
-    /// If the directory is in use, or holds another training or a damaged checkpoint, or `from` holds none.
+    /// If the directory is in use, or holds another run or a damaged checkpoint, or `from` holds no networks.
     pub fn open(
         directory: &Path,
         mut settings: Settings,
@@ -307,7 +307,7 @@ impl Training {
         goal: Goal,
         device: &Device,
     ) -> Result<Self> {
-        // Before anything is written: a training that cannot begin leaves nothing behind.
+        // Checked before anything is written: a run that cannot start leaves no files behind.
         let begins = !directory.join("ledger.json").exists();
         let origin = from.filter(|_| begins).map(|from| Origin::of(from, settings.agent)).transpose()?;
         std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
@@ -315,7 +315,7 @@ impl Training {
         let path = directory.join("settings.json");
         let ledger = Ledger::newest_whole(directory)?;
         if let Some(ledger) = &ledger {
-            // A training that is done makes no further checkpoint, and so would keep what a program killed at its end left.
+            // A finished run writes no further checkpoint, so a killed program's files are removed here.
             tidy(directory, &ledger.files);
         }
         if ledger.is_some() {
@@ -346,7 +346,7 @@ impl Training {
         let origin = origin.filter(|_| ledger.is_none());
         let ledger = ledger.unwrap_or_default();
         let (agent, streams) = (settings.agent, Streams::new(settings.seed));
-        // Ant's contact slots, which are always 0.
+        // Ant's contact slots are always 0.
         let dead = if agent == Agent::Ant { (27..111).collect() } else { Vec::new() };
         let mut buffer = Buffer::replay(streams, agent.dims(), dead, settings.batch);
         let mut sac = Sac::new(&buffer, &settings.sac, device)?;
@@ -384,17 +384,17 @@ impl Training {
         Ok(training)
     }
 
-    /// Whether the goal is reached (or the user stopped it) and the checkpoint written.
+    /// Whether the goal is reached (or the user stopped the run) and the checkpoint is written.
     pub fn finished(&self) -> bool {
         self.finished
     }
 
-    /// How far it is.
+    /// The progress of the run.
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
 
-    /// The rows so far, in the order in which they came.
+    /// The rows collected so far, in order.
     pub fn replay(&self) -> &tce_data::Transitions {
         &self.buffer.members()[0].parts[0]
     }
@@ -410,10 +410,10 @@ impl Training {
         self.goal.until.is_some_and(|until| best >= until)
     }
 
-    /// Some steps; ends with the episode in which the goal is reached or the user interrupts.
+    /// Takes some steps. Ends with the episode in which the goal is reached or the user interrupts.
     ///
     /// # Errors
-    /// If the policy's actions are no numbers any more, or a file cannot be written.
+    /// If the policy's actions are not finite, or a file cannot be written.
     pub fn advance(&mut self, steps: u64) -> Result<()> {
         for _ in 0..steps {
             if self.finished {
@@ -448,7 +448,7 @@ impl Training {
             let (s, reward) = (&self.observation, result.reward as f32);
             self.buffer.replay_mut().push(s, &action, reward, &next, result.terminal, timeout);
         } else if self.length > 1 {
-            // The physics blew up: the episode ends with the row before.
+            // The physics blew up: the episode ends at the row before.
             *self.buffer.replay_mut().timeouts.last_mut().expect("this episode's rows") = true;
         }
         self.observation = next;
@@ -458,7 +458,7 @@ impl Training {
         if trained > 0 && trained.is_multiple_of(self.settings.steps_per_update) {
             let update = trained / self.settings.steps_per_update - 1;
             let batch = self.buffer.sample(update, &self.sac.device());
-            // Metrics cost time, and their means need no more than every tenth.
+            // Metrics cost time. Every tenth update is enough for their means.
             let mut meter = if update.is_multiple_of(10) { Meter::always() } else { Meter::default() };
             self.sac.update(&batch, update, &mut meter);
             self.ledger.meter.join(meter);
@@ -477,7 +477,7 @@ impl Training {
         Ok(())
     }
 
-    /// Whether the action of `step` is a uniformly random one.
+    /// Whether the action of `step` is uniformly random.
     fn explores(&self, step: u64) -> bool {
         let Settings { start, steps_per_update, explore, sac, from, .. } = &self.settings;
         if from.is_none() {
@@ -491,13 +491,13 @@ impl Training {
         f64::from(draw[0]) < *explore
     }
 
-    /// An evaluation with sampled actions, as D4RL's returns are, and the snapshots it is good for.
+    /// Evaluates with sampled actions, as for D4RL's returns, and saves the snapshots whose score is reached.
     fn evaluate(&mut self) -> Result<()> {
         let Settings { agent, shift, seed, episodes, .. } = self.settings;
         let policy = self.sac.policies().remove(0);
         let arena = Arena::new(agent, shift, ScoreTable::default());
         let streams = Streams::new(seed ^ self.ledger.step);
-        // To its end even when the user interrupts: the checkpoint that follows needs it.
+        // It runs to its end even if the user interrupts, because the checkpoint that follows needs it.
         let evaluation = evaluate(&policy, arena, episodes, streams, Actions::Sampled, || false)?;
         let summary = summarise(&evaluation, self.ledger.step);
         let metrics: Vec<_> = self.ledger.meter.take().into_iter().map(|(name, v)| (name, v[0])).collect();
@@ -508,7 +508,7 @@ impl Training {
         self.metrics.log("evaluate", self.ledger.step, 0, metrics)?;
         let score = summary.score.map_or(String::new(), |s| format!(", score {s:.1}"));
         self.progress.message(format!("return {:.0}{score}", summary.mean));
-        // Here and not with the checkpoint: some updates later it is another policy than the one evaluated.
+        // Saved here and not with the checkpoint: some updates later the policy differs from the evaluated one.
         save_card(&policy, &self.directory.join("policy.safetensors"), &self.settings, &summary)?;
         for &at in &self.goal.snapshots {
             if summary.score.is_some_and(|s| s >= at) && self.ledger.snapshots.iter().all(|s| s.at != at) {
@@ -539,8 +539,8 @@ impl Training {
     }
 }
 
-/// Removes older checkpoints than the two of the ledgers and `kept`, and what a killed program left half-written: they cost space
-/// only. Nothing is removed while a ledger cannot be read.
+/// Removes checkpoints other than `kept` and the two in the ledgers, and half-written files of a killed program: they
+/// only waste space. Nothing is removed if a ledger cannot be read.
 fn tidy(directory: &Path, kept: &[(String, String)]) {
     let ledger = |name: &str| read_json::<Ledger>(&directory.join(name));
     let (Ok(last), Ok(previous)) = (ledger("ledger.json"), ledger("previous.json")) else { return };

@@ -1,4 +1,4 @@
-//! Trained source actors of other people, found in the shared folder: for what the zoo does not have.
+//! Trained source actors from other projects in the shared folder, for robots that the zoo does not cover.
 
 use std::path::{Path, PathBuf};
 
@@ -11,8 +11,8 @@ pub fn shared_folder() -> PathBuf {
     std::env::var_os("TCE_SHARED").map_or_else(|| PathBuf::from("../shared"), PathBuf::from)
 }
 
-/// The actors under `shared/policies` that come closest to the behaviour in D4RL's data sets (source domain). Weights are
-/// calibrated so that mean returns are within 10 % of D4RL's. A part of which an actor is missing is empty.
+/// The actors under `shared/policies` whose behaviour is closest to that in D4RL's data sets (source domain). Weights
+/// are calibrated so that mean returns are within 10 % of D4RL's. A part is empty if one of its actors is missing.
 pub fn cast(agent: Agent, shared: &Path) -> Cast {
     use Agent::*;
     let medium: &[(&str, f64)] = match agent {
@@ -27,7 +27,7 @@ pub fn cast(agent: Agent, shared: &Path) -> Cast {
         Walker2d => &[("yth_sac_walker2d_seed5_D_20201002_0053_baba2dc", 1.0)],
         Ant => &[("yth_sac_ant_seed5_D_20201002_0053_baba2dc", 1.0)],
     };
-    // Early stages of training, then the medium actor: the shape of a replay buffer.
+    // Early stages of training, then the medium actor, in shares like those of a replay buffer.
     let replay: &[(&str, f64)] = match agent {
         HalfCheetah => &[
             ("yth_sac_halfcheetah_seed5_B_20201001_0803_e9a4951", 0.15),
