@@ -1,9 +1,9 @@
-//! Brings libmujoco 3.17.0: out of the `mujoco` wheel of PyPI, checked against a pinned SHA-256, into
-//! `third_party/mujoco/` of the workspace (ignored by git).
+//! Downloads libmujoco 3.17.0: extracts it from the `mujoco` wheel on PyPI, checks it against a pinned SHA-256, and
+//! stores it in `third_party/mujoco/` of the workspace (ignored by git).
 //!
-//! Nothing is linked with it: `src/library.rs` opens it when the simulator is first used, and one of the places where it
-//! looks is the folder that this script tells it. `mujoco-rs` has a build script of its own, which is content with a
-//! file named `libmujoco.so` in `MUJOCO_DYNAMIC_LINK_DIR` (`.cargo/config.toml`): the empty linker script in `link/`.
+//! Nothing is linked with it: `src/library.rs` opens it when the simulator is first used, and searches, among other
+//! places, the folder that this script passes to it. `mujoco-rs` has its own build script, which only needs a file
+//! named `libmujoco.so` in `MUJOCO_DYNAMIC_LINK_DIR` (`.cargo/config.toml`): the empty linker script in `link/`.
 
 use std::env;
 use std::fs;
@@ -15,8 +15,8 @@ use sha2::{Digest, Sha256};
 const VERSION: &str = "3.17.0";
 const LIBRARY: &str = "libmujoco.so.3.17.0";
 
-/// One platform of the wheel. The library inside is the same file in the wheels for CPython 3.10 to 3.14; one of
-/// them is named so that the download does not depend on the Python that happens to be installed.
+/// One platform of the wheel. The wheels for CPython 3.10 to 3.14 contain the same library file. One of them is fixed
+/// here, so that the download does not depend on the installed Python.
 struct Platform {
     os: &'static str,
     arch: &'static str,
@@ -52,7 +52,7 @@ fn main() {
             println!("cargo::rustc-env=TCE_MUJOCO_BUILD_DIR={}", dir.display());
         }
         Err(message) => {
-            // Cargo shows these without the noise of a panic.
+            // Cargo shows these lines without a panic message.
             for line in message.lines() {
                 println!("cargo::error={line}");
             }
@@ -60,7 +60,7 @@ fn main() {
     }
 }
 
-/// The directory that holds [`LIBRARY`], fetched if need be.
+/// The directory that contains [`LIBRARY`]; downloads it if necessary.
 fn library_dir() -> Result<PathBuf, String> {
     let os = env::var("CARGO_CFG_TARGET_OS").unwrap_or_default();
     let arch = env::var("CARGO_CFG_TARGET_ARCH").unwrap_or_default();
@@ -105,7 +105,7 @@ fn library_dir() -> Result<PathBuf, String> {
     Ok(dir)
 }
 
-/// The library that the user names in `TCE_MUJOCO_LIB`.
+/// The library that the user specifies in `TCE_MUJOCO_LIB`.
 fn own_library(path: &Path, platform: Option<&Platform>) -> Result<PathBuf, String> {
     let named_right = path.file_name().is_some_and(|n| n == LIBRARY);
     if !path.is_absolute() || !named_right || !path.is_file() {
@@ -124,8 +124,8 @@ fn own_library(path: &Path, platform: Option<&Platform>) -> Result<PathBuf, Stri
     Ok(path.parent().expect("an absolute path of a file").to_owned())
 }
 
-/// Downloads the wheel, takes the library out, checks it and gives it its place. Works in a directory of this process
-/// and ends with a rename, so that builds that run at the same time do not disturb each other.
+/// Downloads the wheel, extracts the library, checks it and moves it into place. Works in a directory of this process
+/// and ends with a rename, so that parallel builds do not disturb each other.
 fn fetch(platform: &Platform, dir: &Path) -> Result<(), String> {
     let parent = dir.parent().expect("third_party/mujoco");
     fs::create_dir_all(dir).map_err(|e| format!("cannot create {}: {e}", dir.display()))?;
@@ -168,7 +168,7 @@ fn fetch_in(platform: &Platform, work: &Path, target: &Path) -> Result<(), Strin
     fs::rename(&library, target).map_err(|e| format!("cannot rename into {}: {e}", target.display()))
 }
 
-/// The first Python 3 of the path.
+/// The first Python 3 in the search path.
 fn python() -> Result<Command, String> {
     for name in ["python3", "python"] {
         let is_3 = Command::new(name).args(["-c", "import sys; sys.exit(sys.version_info[0] != 3)"]).output();

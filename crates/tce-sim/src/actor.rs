@@ -1,21 +1,21 @@
-//! Who acts in an environment.
+//! Actors: what chooses the actions in an environment.
 
 use tce_base::Rng;
 
-/// Something that chooses actions.
+/// Chooses actions.
 pub trait Actor: Sync {
-    /// What a lane remembers of its episode; `()` for actors that look at the observation alone.
+    /// A lane's memory of its episode; `()` for actors that use only the current observation.
     type Memory: Send;
 
-    /// The memory of a lane whose episode begins.
+    /// The memory of a lane at the start of an episode.
     fn start(&self) -> Self::Memory;
 
-    /// Fills `actions` (`[rows, act_dim]`, row-major, in [-1, 1]) for `observations` (`[rows, obs_dim]`).
-    /// `memories` and `rngs` hold one memory and one generator per row, the latter for actors that sample; a row's numbers must
-    /// come from its own of both only, so that they do not depend on which other rows are in the batch.
+    /// Fills `actions` (`[rows, act_dim]`, row-major, in [-1, 1]) for `observations` (`[rows, obs_dim]`). `memories`
+    /// and `rngs` hold one memory and one random generator per row, the latter for actors that sample. A row's actions
+    /// may depend only on its own memory and generator, so that they do not depend on the other rows of the batch.
     fn act(&self, observations: &[f32], memories: &mut [Self::Memory], rngs: &mut [Rng], actions: &mut [f32]);
 
-    /// Tells a lane's memory the reward of the action that was just taken, if the episode goes on.
+    /// Passes the reward of the last action to a lane's memory, if the episode continues.
     fn reward(&self, _memory: &mut Self::Memory, _reward: f64) {}
 }
 

@@ -1,4 +1,4 @@
-//! One-step predictions for states and actions that need not come from a rollout.
+//! One-step predictions for any states and actions, also those that are not from a rollout.
 
 use rayon::prelude::*;
 use tce_base::{Interrupted, interrupted};
@@ -8,29 +8,29 @@ use crate::SimError;
 use crate::env::Env;
 use crate::models::compiled;
 
-/// What the simulator makes of a batch of states and actions.
+/// The simulator's results for a batch of states and actions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Simulated {
-    /// s', `[N, obs_dim]`; NaN in rows in which the physics blew up.
+    /// s', `[N, obs_dim]`; NaN in rows where the physics blew up.
     pub next_observations: Vec<f32>,
-    /// r, `[N]`; NaN in rows in which the physics blew up.
+    /// r, `[N]`; NaN in rows where the physics blew up.
     pub rewards: Vec<f32>,
-    /// Whether the robot's rule ends the episode at s', `[N]`; true in rows in which the physics blew up.
+    /// Whether the robot's rule ends the episode at s', `[N]`; true in rows where the physics blew up.
     pub terminals: Vec<bool>,
 }
 
 impl Simulated {
-    /// Whether the physics held in row `i`.
+    /// Whether the physics stayed stable in row `i`.
     pub fn held(&self, i: usize) -> bool {
         self.rewards[i].is_finite()
     }
 }
 
-/// Rows that one environment simulates before the work is split further.
+/// Rows that one environment simulates; the work is split into chunks of this size.
 const CHUNK: usize = 64;
 
-/// One step from each of `states` (`[N, obs_dim]`) under `actions` (`[N, act_dim]`), in parallel. What a state does not
-/// describe is treated as in [`Env::set_state`].
+/// Simulates one step from each of `states` (`[N, obs_dim]`) under `actions` (`[N, act_dim]`), in parallel. Coordinates
+/// that a state does not contain are set as in [`Env::set_state`].
 ///
 /// # Errors
 /// If the sizes do not fit the agent, an input is not finite, or the user interrupts.

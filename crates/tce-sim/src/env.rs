@@ -1,7 +1,7 @@
 //! One environment: reset, step, observation, reward and the end of an episode.
 //!
-//! Everything here follows OpenAI Gym's v2 environments (Ant: contact forces always zero), which made the public data;
-//! the numbers are measured in `shared/reference/environments.md` by replaying those data.
+//! Everything here follows OpenAI Gym's v2 environments (Ant: contact forces always zero), which produced the public
+//! data. The numbers were measured by replaying those data (`shared/reference/environments.md`).
 
 use std::sync::Arc;
 
@@ -14,15 +14,15 @@ use tce_data::{Agent, Shift};
 use crate::SimError;
 use crate::models::compiled;
 
-/// Steps after which an episode is cut (a time-out, not a terminal).
+/// Number of steps after which an episode is cut (a time-out, not a terminal).
 pub const EPISODE_LIMIT: usize = 1000;
 
-/// What distinguishes the robots beside their models.
+/// Differences between the robots other than their models.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Task {
     /// MuJoCo steps per environment step.
     frame_skip: usize,
-    /// Leading coordinates that the observation leaves out (x; for Ant also y).
+    /// Number of leading coordinates that the observation leaves out (x; for Ant also y).
     pub(crate) hidden: usize,
     /// Observed velocities are clipped to this magnitude.
     pub(crate) velocity_clip: Option<f64>,
@@ -70,19 +70,19 @@ pub(crate) fn task(agent: Agent) -> Task {
     }
 }
 
-/// What one step brings beside the next observation.
+/// The result of one step, apart from the next observation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepResult {
     /// Reward.
     pub reward: f64,
-    /// Whether the episode is over by the robot's rule. The limit of [`EPISODE_LIMIT`] steps is not counted here.
+    /// Whether the episode ended by the robot's rule. The limit of [`EPISODE_LIMIT`] steps does not count here.
     pub terminal: bool,
-    /// Whether the physics blew up (MuJoCo found a non-finite or huge number and reset the robot). The step is then
-    /// none of the environment's dynamics: throw it away and end the episode.
+    /// Whether the physics blew up (MuJoCo found a non-finite or huge number and reset the robot). The step then does
+    /// not follow the environment's dynamics: discard it and end the episode.
     pub unstable: bool,
 }
 
-/// One simulated robot. Environments share their compiled model; each has a state of its own.
+/// One simulated robot. Environments share their compiled model; each has its own state.
 pub struct Env {
     agent: Agent,
     task: Task,
@@ -90,8 +90,8 @@ pub struct Env {
     /// Seconds per step.
     dt: f64,
     torso: usize,
-    /// The x that the next reward is measured from. For Ant that is the torso body's position as the last RK4 stage
-    /// left it, which lags behind the coordinate: the original environment reads it so.
+    /// The x from which the next reward is measured. For Ant that is the torso body's position after the last RK4
+    /// stage, which lags behind the coordinate: the original environment reads this value.
     x: f64,
 }
 
@@ -104,7 +104,7 @@ impl Env {
         Ok(Self::with_model(agent, compiled(agent, shift)?))
     }
 
-    /// A robot of a model that is compiled already.
+    /// A robot whose model is already compiled.
     pub(crate) fn with_model(agent: Agent, model: Arc<MjModel>) -> Self {
         let task = task(agent);
         let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").expect("every robot has a torso");
@@ -112,7 +112,7 @@ impl Env {
         Self { agent, task, data: MjData::new(model), dt, torso, x: 0.0 }
     }
 
-    /// Which robot it is.
+    /// The robot's agent.
     pub fn agent(&self) -> Agent {
         self.agent
     }
@@ -122,7 +122,7 @@ impl Env {
         self.dt
     }
 
-    /// All coordinates, with those the observation leaves out.
+    /// All coordinates, including those that the observation leaves out.
     pub fn qpos(&self) -> &[f64] {
         self.data.qpos()
     }
@@ -132,7 +132,7 @@ impl Env {
         self.data.qvel()
     }
 
-    /// Starts an episode: the rest pose with noise. Fills `obs`, of the agent's observation dimension.
+    /// Starts an episode from the rest pose with noise. Fills `obs`, which has the agent's observation dimension.
     pub fn reset(&mut self, rng: &mut Rng, obs: &mut [f32]) {
         self.data.reset();
         let width = self.task.position_noise;
@@ -158,12 +158,12 @@ impl Env {
         self.observe(obs);
     }
 
-    /// Puts the robot into the state that `obs` describes. What it does not describe is set to zero: the root's x (for
-    /// Ant also y), of which the dynamics do not depend, and the solver's warm start. Velocities that the observation
-    /// clipped are taken at the clip.
+    /// Puts the robot into the state that `obs` describes. Values not in `obs` are set to zero: the root's x (for Ant
+    /// also y), which does not affect the dynamics, and the solver's warm start. Velocities that the observation
+    /// clipped are set to the clipping bound.
     ///
     /// # Panics
-    /// If `obs` has not the agent's dimension.
+    /// If `obs` does not have the agent's dimension.
     pub fn set_state(&mut self, obs: &[f32]) {
         assert_eq!(obs.len(), self.agent.dims().0, "observation dimension of {}", self.agent);
         self.data.reset();
@@ -176,12 +176,12 @@ impl Env {
         self.x = 0.0;
     }
 
-    /// The velocities, to be changed before a step.
+    /// The velocities, for changes before a step.
     pub(crate) fn qvel_mut(&mut self) -> &mut [f64] {
         self.data.qvel_mut()
     }
 
-    /// How far Ant's torso position lags behind its coordinate, m; zero for the others.
+    /// The lag of Ant's torso position behind its coordinate, m; zero for the others.
     pub(crate) fn lag(&self) -> f64 {
         self.x - self.data.qpos()[0]
     }
@@ -191,10 +191,10 @@ impl Env {
         self.x = self.data.qpos()[0] + lag;
     }
 
-    /// Holds `action` (clamped to [-1, 1] by the motors) for one step and fills `obs` with the next observation.
+    /// Applies `action` (clamped to [-1, 1] by the motors) for one step and fills `obs` with the next observation.
     ///
     /// # Panics
-    /// If `action` or `obs` has not the agent's dimension.
+    /// If `action` or `obs` does not have the agent's dimension.
     pub fn step(&mut self, action: &[f32], obs: &mut [f32]) -> StepResult {
         assert_eq!(action.len(), self.agent.dims().1, "action dimension of {}", self.agent);
         widen(self.data.ctrl_mut(), action);
@@ -214,16 +214,16 @@ impl Env {
         StepResult { reward, terminal, unstable }
     }
 
-    /// Writes the observation of the present state.
+    /// Writes the observation of the current state.
     ///
     /// # Panics
-    /// If `obs` has not the agent's dimension.
+    /// If `obs` does not have the agent's dimension.
     pub fn observe(&self, obs: &mut [f32]) {
         assert_eq!(obs.len(), self.agent.dims().0, "observation dimension of {}", self.agent);
         let positions = &self.data.qpos()[self.task.hidden..];
         let velocities = self.data.qvel();
-        // Ant's observation ends with 84 contact forces, which are zero in these data: `mj_rnePostConstraint` is not
-        // called, as in the MuJoCo versions that made them.
+        // Ant's observation ends with 84 contact forces, which are zero in the public data. As in the MuJoCo versions
+        // that produced these data, `mj_rnePostConstraint` is not called.
         obs.fill(0.0);
         for (o, &q) in obs.iter_mut().zip(positions) {
             *o = q as f32;
@@ -246,8 +246,8 @@ fn widen(to: &mut [f64], from: &[f32]) {
     }
 }
 
-/// The robots' rules for the end of an episode, on the state after a step: observed coordinates and all velocities.
-/// NaN is terminal wherever something is tested.
+/// The robots' rules for the end of an episode, applied to the state after a step: observed coordinates and all
+/// velocities. If a tested value is NaN, the state is terminal.
 fn is_terminal(agent: Agent, positions: &[f64], velocities: &[f64]) -> bool {
     let finite = || positions.iter().chain(velocities).all(|x| x.is_finite());
     let height = positions[0];
@@ -263,7 +263,7 @@ fn is_terminal(agent: Agent, positions: &[f64], velocities: &[f64]) -> bool {
     !healthy
 }
 
-/// Coordinates in an observation.
+/// Number of coordinates in an observation.
 pub(crate) fn observed_positions(agent: Agent) -> usize {
     match agent {
         Agent::HalfCheetah | Agent::Walker2d => 8,
@@ -272,7 +272,7 @@ pub(crate) fn observed_positions(agent: Agent) -> usize {
     }
 }
 
-/// Velocities in an observation.
+/// Number of velocities in an observation.
 pub(crate) fn observed_velocities(agent: Agent) -> usize {
     match agent {
         Agent::HalfCheetah | Agent::Walker2d => 9,
@@ -281,10 +281,10 @@ pub(crate) fn observed_velocities(agent: Agent) -> usize {
     }
 }
 
-/// Whether the robot's rule ends the episode at `next_obs`. Needs no simulator: for transitions that a model generated.
+/// Whether the robot's rule ends the episode at `next_obs`. It needs no simulator: for generated transitions.
 ///
 /// # Panics
-/// If `next_obs` has not the agent's dimension.
+/// If `next_obs` does not have the agent's dimension.
 pub fn terminal_rule(agent: Agent, next_obs: &[f32]) -> bool {
     assert_eq!(next_obs.len(), agent.dims().0, "observation dimension of {agent}");
     let mut state = [0.0; 27];

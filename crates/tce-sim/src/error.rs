@@ -1,19 +1,19 @@
-//! What can go wrong in the simulator, and before there is one.
+//! Errors of the simulator, and of finding its library.
 
 use std::path::PathBuf;
 
 use tce_data::{Agent, Shift};
 
-/// The version that the replayed data sets confirm; 4.0.0 drifts on Ant (p99 about 1e-3).
+/// The version confirmed by replaying the public data sets. Version 4.0.0 deviates on Ant (p99 about 1e-3).
 pub(crate) const VERSION: &str = "3.17.0";
 
-/// The library's name, in the wheel and wherever it is looked for.
+/// The library's file name, in the wheel and in all search places.
 pub(crate) const FILE: &str = "libmujoco.so.3.17.0";
 
-/// Names a library of the user's own, which is then the only one that is tried.
+/// Environment variable with the path of the user's own library. If it is set, no other library is tried.
 pub(crate) const VARIABLE: &str = "TCE_MUJOCO_LIB";
 
-/// What to do about it.
+/// Instructions for the user.
 pub(crate) const HELP: &str = "To get the library:\n  \
      pip install --no-deps --only-binary=:all: --python-version 3.12 --target mujoco-3.17.0 mujoco==3.17.0\n  \
      export TCE_MUJOCO_LIB=$PWD/mujoco-3.17.0/mujoco/libmujoco.so.3.17.0\n\
@@ -22,43 +22,43 @@ pub(crate) const HELP: &str = "To get the library:\n  \
 /// Why there is no simulator.
 #[derive(Debug, thiserror::Error)]
 pub enum LibraryError {
-    /// No library lies where one is looked for.
+    /// None of the search places contains the library.
     #[error("{FILE}, the simulator, is not here. Looked for it at:\n{places}{HELP}")]
     Missing {
-        /// A line for each place.
+        /// One line for each place.
         places: String,
     },
-    /// The variable that names a library names none.
+    /// The environment variable is set, but there is no such file.
     #[error("{VARIABLE} is `{}`: found no such file, expected the path of {FILE}.\n{HELP}", path.display())]
     Named {
-        /// What the variable says.
+        /// The path in the variable.
         path: PathBuf,
     },
-    /// The file that was found is no library, or not one for this machine.
+    /// The file is not a library, or not one for this machine.
     #[error("{}: this is not a MuJoCo that can be used here: {reason}.\nPut {FILE} in its place.\n{HELP}", path.display())]
     Unusable {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The message of the operating system.
         reason: String,
     },
-    /// The processor is older than MuJoCo's build.
+    /// The processor does not support the instructions of MuJoCo's build.
     #[error("this processor lacks AVX, which {FILE} needs; commands that do not simulate work without it")]
     Processor,
-    /// Another MuJoCo than the one the models are made for.
+    /// The MuJoCo version differs from the one that the models are made for.
     #[error("{}: found MuJoCo {found}, expected {VERSION}, with which the models were checked.\n{HELP}", path.display())]
     Version {
-        /// The file.
+        /// The library file.
         path: PathBuf,
         /// Its version.
         found: String,
     },
 }
 
-/// What can go wrong in the simulator.
+/// Errors of the simulator.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
-    /// MuJoCo refused a generated model: a fault of this program.
+    /// MuJoCo rejected a generated model: a bug of this program.
     #[error("model {agent}-{shift}: MuJoCo refuses it: {message}")]
     Model {
         /// Robot.
@@ -68,13 +68,13 @@ pub enum SimError {
         /// MuJoCo's message.
         message: String,
     },
-    /// There is no MuJoCo, or another one than the models are made for.
+    /// MuJoCo was not found, or its version differs from the one that the models are made for.
     #[error(transparent)]
     Library(#[from] LibraryError),
     /// A table or buffer does not have the robot's dimensions.
     #[error("{what}: found {found}, expected {expected} for {agent}")]
     Dimension {
-        /// What was measured.
+        /// What has the wrong size.
         what: &'static str,
         /// Robot.
         agent: Agent,
@@ -88,22 +88,22 @@ pub enum SimError {
     Option {
         /// Name of the option.
         option: &'static str,
-        /// Value found.
+        /// The value.
         found: usize,
-        /// What is allowed.
+        /// The allowed values.
         expected: &'static str,
     },
-    /// A number that must be finite is not.
+    /// A number is not finite.
     #[error("{what}, row {row}: found {value}, expected a finite number")]
     NotFinite {
-        /// Which table.
+        /// The table that contains it.
         what: &'static str,
-        /// Row in it.
+        /// Its row.
         row: usize,
         /// The value.
         value: f32,
     },
-    /// The physics blew up again and again.
+    /// The physics blew up repeatedly.
     #[error(
         "{agent}-{shift}: the simulation became unstable {count} times in {rows} rows; the actor's actions drive it \
          there, check the policy"
@@ -113,9 +113,9 @@ pub enum SimError {
         agent: Agent,
         /// Shift.
         shift: Shift,
-        /// Episodes given up.
+        /// Number of abandoned episodes.
         count: usize,
-        /// Rows collected by then.
+        /// Rows collected up to then.
         rows: usize,
     },
     /// The user asked to stop.

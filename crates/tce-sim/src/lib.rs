@@ -6,9 +6,9 @@
 //! | One environment? | [`Env`] |
 //! | A data set? | [`collect`] |
 //! | A policy's returns? | [`evaluate`] |
-//! | What it looks like? | [`evaluate_recorded`], then a [`video::Video`] of the recordings |
+//! | What does it look like? | [`evaluate_recorded`], then a [`video::Video`] of the recordings |
 //! | Do stored transitions follow the dynamics? | [`replay`] (whole data sets), [`simulate`] (single rows) |
-//! | Is there a MuJoCo? | [`open_library`], before a command begins; everything else opens it by itself |
+//! | Is MuJoCo available? | [`open_library`], called before a command starts; everything else opens it automatically |
 //! | Would a generated state end the episode? | [`terminal_rule`] |
 
 mod actor;

@@ -1,12 +1,12 @@
 //! libmujoco, opened when the simulator is first used.
 //!
-//! What needs no simulator runs where MuJoCo is not installed, and a copied program finds the library beside itself.
-//! `mujoco-rs` calls MuJoCo's functions by their names and expects a linker to know them. The linker finds them here:
-//! every one is a function of ours that jumps to an address, and [`open`] fills in the addresses. Unlike trampolines in
-//! assembler, these work on any processor, and the compiler compares their signatures with those of `mujoco-rs`. Tables of
-//! data that MuJoCo exports cannot be had this way; `mujoco-rs` uses none.
+//! Commands that need no simulator run without MuJoCo, and a copied program finds the library next to itself.
+//! `mujoco-rs` calls MuJoCo's functions by name and expects the linker to find them. They are defined here: each is a
+//! function that jumps to an address, and [`open`] fills in the addresses. Unlike assembler trampolines, these
+//! functions work on any processor, and the compiler checks their signatures against those of `mujoco-rs`. This does
+//! not work for data tables exported by MuJoCo, but `mujoco-rs` uses none.
 //!
-//! A function that is missing from the list shows when a binary is linked: `undefined symbol: mj_...`. Add it.
+//! If a function is missing from the list, linking a binary fails: `undefined symbol: mj_...`. Add it.
 
 use std::env;
 use std::ffi::{CStr, c_char, c_int, c_void};
@@ -21,23 +21,24 @@ use mujoco_rs::mujoco_c::{mjData, mjLogConfig, mjModel, mjVFS, mjfLogHandler, mj
 use crate::SimError;
 use crate::error::{FILE, LibraryError, VARIABLE, VERSION};
 
-/// Where the build script put the library: for `cargo run`, tests and benches.
+/// The folder where the build script stored the library: for `cargo run`, tests and benches.
 const BUILT_WITH: Option<&str> = option_env!("TCE_MUJOCO_BUILD_DIR");
 
-/// Opens libmujoco, unless it is open, and returns where it lies.
+/// Opens libmujoco, unless it is already open, and returns its path.
 ///
-/// It is looked for where `TCE_MUJOCO_LIB` says; if that is not set, beside the program, in `../lib` of there, where the
-/// build put it, and where the system's loader looks (`LD_LIBRARY_PATH`). The first file counts, good or bad.
+/// The path is that in `TCE_MUJOCO_LIB`. If this is not set, the search order is: next to the program, in `../lib`
+/// relative to it, in the build script's folder, and in the search path of the system's loader (`LD_LIBRARY_PATH`). The
+/// first file found is used, even if it is unusable.
 ///
 /// # Errors
-/// If there is none, or if it is not MuJoCo 3.17.0.
+/// If there is no library, or if it is not MuJoCo 3.17.0.
 pub fn open() -> Result<PathBuf, SimError> {
     static OPENED: Mutex<Option<PathBuf>> = Mutex::new(None);
     let mut opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(path) = &*opened {
         return Ok(path.clone());
     }
-    // Without it, MuJoCo ends the process by an illegal instruction.
+    // Without AVX, MuJoCo would crash the process with an illegal instruction.
     #[cfg(target_arch = "x86_64")]
     if !is_x86_feature_detected!("avx") {
         return Err(LibraryError::Processor.into());
@@ -47,11 +48,11 @@ pub fn open() -> Result<PathBuf, SimError> {
     Ok(opened.insert(path).clone())
 }
 
-/// The library to use. The last resort is the bare name, which leaves the search to the system.
+/// The path of the library to use. If no file is found, it is the bare name, which leaves the search to the system.
 fn find() -> Result<PathBuf, LibraryError> {
     if let Some(path) = env::var_os(VARIABLE).filter(|v| !v.is_empty()) {
         let path = PathBuf::from(path);
-        // With a folder in front, the loader does not search for it.
+        // The loader does not search for a path that contains a folder.
         let absolute = std::path::absolute(&path).unwrap_or_else(|_| path.clone());
         return if absolute.is_file() { Ok(absolute) } else { Err(LibraryError::Named { path }) };
     }
@@ -59,7 +60,7 @@ fn find() -> Result<PathBuf, LibraryError> {
     if let Some(found) = places.iter().find(|p| p.is_file()) {
         return Ok(found.clone());
     }
-    // SAFETY: MuJoCo's initialisers register its decoders and touch nothing of ours.
+    // SAFETY: MuJoCo's initialisers register its decoders and touch none of our data.
     if unsafe { Library::open(Some(FILE), RTLD_NOW | RTLD_LOCAL) }.map(std::mem::forget).is_ok() {
         return Ok(PathBuf::from(FILE));
     }
@@ -71,7 +72,7 @@ fn find() -> Result<PathBuf, LibraryError> {
     Err(LibraryError::Missing { places: text })
 }
 
-/// Files to try, for the program `program`.
+/// Candidate paths for the program `program`.
 fn places(program: Option<&Path>) -> Vec<PathBuf> {
     let beside = program.and_then(Path::parent);
     let lib = beside.and_then(Path::parent).map(|prefix| prefix.join("lib"));
@@ -79,14 +80,14 @@ fn places(program: Option<&Path>) -> Vec<PathBuf> {
     folders.into_iter().flatten().map(|folder| folder.join(FILE)).collect()
 }
 
-/// Opens `path` for good and takes the addresses from it.
+/// Opens `path` permanently and reads the function addresses from it.
 fn load(path: &Path) -> Result<(), LibraryError> {
     let unusable = |reason: String| LibraryError::Unusable { path: path.to_owned(), reason };
     let system = |e: libloading::Error| {
         let detail = std::error::Error::source(&e).map_or_else(|| e.to_string(), ToString::to_string);
         unusable(detail)
     };
-    // SAFETY: MuJoCo's initialisers register its decoders and touch nothing of ours.
+    // SAFETY: MuJoCo's initialisers register its decoders and touch none of our data.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) }.map_err(system)?;
     // SAFETY: this is the function's type in every version of MuJoCo, and it returns a constant string.
     let found = unsafe {
@@ -102,16 +103,16 @@ fn load(path: &Path) -> Result<(), LibraryError> {
     Ok(())
 }
 
-/// What stands in the table until [`open`] has filled it.
+/// Initial entry of the table, until [`open`] has filled it.
 extern "C" fn closed() -> ! {
     eprintln!("MuJoCo was called before it was opened: a fault of this program (see tce-sim/src/library.rs)");
     std::process::abort()
 }
 
-/// Defines the table of addresses and the functions that jump to them.
+/// Defines the table of addresses and the functions that jump to these addresses.
 macro_rules! forward {
     ($(fn $name:ident($($argument:ident: $type:ty),*) $(-> $result:ty)?;)*) => {
-        /// Where MuJoCo's functions lie.
+        /// The addresses of MuJoCo's functions.
         #[expect(non_snake_case, reason = "C's names")]
         struct Functions {
             $($name: AtomicPtr<c_void>,)*
@@ -133,16 +134,16 @@ macro_rules! forward {
         }
 
         $(
-            // The same type as in the bindings, or it does not compile.
+            // Compiles only if the type is the same as in the bindings.
             const _: unsafe extern "C" fn($($type),*) $(-> $result)? = mujoco_rs::mujoco_c::$name;
 
             /// MuJoCo's function of this name.
             #[unsafe(no_mangle)]
             unsafe extern "C" fn $name($($argument: $type),*) $(-> $result)? {
-                // A relaxed load: whoever comes here went through the lock in `open`.
+                // A relaxed load is enough: every caller has gone through the lock in `open`.
                 let address = FUNCTIONS.$name.load(Ordering::Relaxed);
-                // SAFETY: the address of the C function of this name in MuJoCo 3.17.0, for which the bindings were made; or
-                // `closed`, which takes nothing and does not return.
+                // SAFETY: this is the address of the C function of the same name in MuJoCo 3.17.0, for which the
+                // bindings were made; or `closed`, which takes no arguments and does not return.
                 unsafe {
                     let function: unsafe extern "C" fn($($type),*) $(-> $result)? = std::mem::transmute(address);
                     function($($argument),*)
@@ -201,7 +202,7 @@ mod tests {
         let first = open().unwrap();
         assert_eq!(first.file_name(), Some(OsStr::new(FILE)));
         assert_eq!(open().unwrap(), first);
-        // SAFETY: takes nothing and returns a number.
+        // SAFETY: the function takes no arguments and returns a number.
         assert_eq!(unsafe { mj_version() }, 3_017_000);
     }
 }

@@ -1,7 +1,8 @@
-//! One episode as it went, to be drawn afterwards.
+//! Records one episode so that it can be drawn afterwards.
 //!
-//! Only coordinates are kept. The positions of the limbs are worked out anew when a picture is drawn, in a state of its own: asking
-//! the running simulation for them would change what it does next (Ant's reward reads what the last integration stage left).
+//! Only coordinates are stored. The positions of the limbs are computed again when a picture is drawn, in a separate
+//! state. Computing them in the running simulation would change its next step (Ant's reward reads what the last
+//! integration stage left).
 
 use serde::{Deserialize, Serialize};
 use tce_data::{Agent, Shift};
@@ -10,9 +11,9 @@ use tce_data::{Agent, Shift};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ending {
-    /// By the robot's rule: it fell, or left the states that the rule allows.
+    /// By the robot's rule: the robot fell, or left the states that the rule allows.
     Fell,
-    /// After [`crate::EPISODE_LIMIT`] steps.
+    /// At the limit of [`crate::EPISODE_LIMIT`] steps.
     TimeLimit,
     /// The physics blew up.
     Unstable,
@@ -25,7 +26,7 @@ pub struct Recording {
     pub agent: Agent,
     /// The domain.
     pub shift: Shift,
-    /// How it ended.
+    /// How the episode ended.
     pub ending: Ending,
     coordinates: usize,
     poses: Vec<f64>,
@@ -33,19 +34,19 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// A recording that has not begun.
+    /// An empty recording.
     pub(crate) fn new(agent: Agent, shift: Shift) -> Self {
         Self { agent, shift, ending: Ending::TimeLimit, coordinates: 0, poses: Vec::new(), returns: Vec::new() }
     }
 
-    /// Adds the state after a step, or first of all that after the reset.
+    /// Adds the state after a step; the first state is the one after the reset.
     pub(crate) fn push(&mut self, qpos: &[f64], episode_return: f64) {
         self.coordinates = qpos.len();
         self.poses.extend_from_slice(qpos);
         self.returns.push(episode_return);
     }
 
-    /// Steps.
+    /// Number of steps.
     pub fn length(&self) -> usize {
         self.returns.len() - 1
     }

@@ -1,4 +1,4 @@
-//! Holding stored transitions against the simulator.
+//! Compares stored transitions with the simulator.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -9,7 +9,7 @@ use crate::SimError;
 use crate::env::{Env, observed_positions, observed_velocities, task};
 use crate::models::compiled;
 
-/// Quantiles of absolute errors, by linear interpolation; zero where there are no rows.
+/// Quantiles of absolute errors, by linear interpolation; zero if there are no rows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quantiles {
     /// 0.5.
@@ -23,7 +23,7 @@ pub struct Quantiles {
 }
 
 impl Quantiles {
-    /// Of `values`, in any order. NaN counts as larger than every number.
+    /// Quantiles of `values`, which may be in any order. NaN counts as larger than every number.
     pub fn of(mut values: Vec<f64>) -> Self {
         let Some(last) = values.len().checked_sub(1) else { return Self::default() };
         values.sort_by(f64::total_cmp);
@@ -37,7 +37,7 @@ impl Quantiles {
     }
 }
 
-/// How well a table of transitions follows the dynamics of an environment, one step at a time.
+/// The one-step errors of a table of transitions with respect to an environment's dynamics.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReplayReport {
     /// Robot.
@@ -48,9 +48,9 @@ pub struct ReplayReport {
     pub rows: usize,
     /// Rows compared.
     pub compared: usize,
-    /// Rows not compared, because velocities were clipped in s and are not known from the row before.
+    /// Rows not compared, because velocities were clipped in s and the row before does not give them.
     pub skipped_clipped: usize,
-    /// Rows compared although velocities were clipped in s: the replay of the row before knew them.
+    /// Rows compared although velocities were clipped in s: the replay of the row before gave them.
     pub carried: usize,
     /// Largest absolute error over the components of s', per row.
     pub next_observation: Quantiles,
@@ -58,7 +58,7 @@ pub struct ReplayReport {
     pub reward: Quantiles,
     /// Rows whose terminal mark differs from the simulator's.
     pub terminal_mismatches: Vec<usize>,
-    /// Compared rows in which the physics blew up; their errors count as infinite.
+    /// Compared rows in which the physics blew up. Their errors count as infinite.
     pub unstable: usize,
 }
 
@@ -70,7 +70,7 @@ impl ReplayReport {
     /// Bound on the 99th percentile of the error of r.
     pub const REWARD_P99: f64 = 1e-5;
 
-    /// Whether the table comes from this environment, to the rounding of its 32-bit numbers.
+    /// Whether the table comes from this environment, up to the rounding of its 32-bit numbers.
     pub fn passes(&self) -> bool {
         self.compared > 0
             && self.next_observation.median <= Self::NEXT_OBSERVATION_MEDIAN
@@ -87,11 +87,11 @@ enum Outcome {
 
 /// Replays every transition: puts the robot into s, holds a for one step, and compares s', r and the terminal mark.
 ///
-/// Rows of an episode are replayed in order, since two things are only known from the row before: velocities that
-/// Hopper's and Walker2d's observations clip at 10, and the lag of Ant's torso position, which its reward contains.
+/// Rows of an episode are replayed in order, because two values are only known from the row before: velocities that
+/// Hopper's and Walker2d's observations clip at 10, and the lag of Ant's torso position, which affects its reward.
 ///
 /// # Errors
-/// If the table's dimensions are not the agent's, or the user interrupts.
+/// If the table does not have the agent's dimensions, or the user interrupts.
 pub fn replay(
     agent: Agent,
     shift: Shift,
@@ -155,7 +155,7 @@ pub fn replay(
     Ok(report)
 }
 
-/// What the replay of one row tells about the next.
+/// Values from the replay of one row that the next row needs.
 struct Carry {
     velocities: Vec<f64>,
     lag: f64,
@@ -177,7 +177,7 @@ fn replay_episode(env: &mut Env, data: &Transitions, episode: Episode) -> Result
             carry = None;
         }
         env.set_state(observation);
-        // An observed velocity at the clip may have been any larger one. The margin is that of 32-bit rounding.
+        // An observed velocity at the clipping bound may have been any larger one. The margin covers 32-bit rounding.
         let at_clip = |v: f32| clip.is_some_and(|clip| v.abs() as f64 >= clip - 1e-6);
         let seen = &observation[positions..positions + velocities];
         let carried = seen.iter().any(|&v| at_clip(v));
@@ -211,12 +211,12 @@ fn replay_episode(env: &mut Env, data: &Transitions, episode: Episode) -> Result
     Ok(outcomes)
 }
 
-/// The largest absolute difference between the present state, as observed but not rounded, and `observation`.
+/// The largest absolute difference between the current state, observed without rounding, and `observation`.
 fn largest_error(env: &Env, observation: &[f32]) -> f64 {
     let task = task(env.agent());
     let positions = env.qpos()[task.hidden..].iter().copied();
     let velocities = env.qvel().iter().map(|&v| task.velocity_clip.map_or(v, |clip| v.clamp(-clip, clip)));
-    // Ant's contact forces follow; they are zero.
+    // Ant's observation continues with its contact forces, which are zero.
     let state = positions.chain(velocities).chain(std::iter::repeat(0.0));
     let mut largest = 0.0_f64;
     for (x, &stored) in state.zip(observation) {

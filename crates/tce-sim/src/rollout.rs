@@ -1,4 +1,4 @@
-//! Many environments in lockstep, so that a policy sees them as one batch.
+//! Runs many environments in lockstep, so that a policy gets their observations as one batch.
 
 use mujoco_rs::prelude::MjModel;
 use rayon::prelude::*;
@@ -13,23 +13,22 @@ use crate::models::compiled;
 use crate::recording::{Ending, Recording};
 use crate::{SimError, StepResult};
 
-/// How to collect.
+/// Options of `collect`.
 #[derive(Clone, Copy)]
 pub struct CollectOptions<'a> {
-    /// Rows in all.
+    /// Total number of rows.
     pub rows: usize,
-    /// Environments in lockstep. The rows depend on it (each lane rolls episodes of its own), but not on the number of
-    /// threads.
+    /// Number of environments in lockstep. The rows depend on it (each lane has its own episodes), but not on the
+    /// number of threads.
     pub lanes: usize,
-    /// Where the random numbers come from: streams `collect/reset` and `collect/action`, indexed by
-    /// `lane << 32 | episode`.
+    /// The source of random numbers: streams `collect/reset` and `collect/action`, indexed by `lane << 32 | episode`.
     pub streams: Streams,
-    /// Where to report rows.
+    /// Where the number of collected rows is reported.
     pub progress: Option<&'a Progress>,
 }
 
 impl CollectOptions<'_> {
-    /// `rows` rows on 32 lanes.
+    /// Options for `rows` rows with 32 lanes.
     pub fn new(rows: usize, streams: Streams) -> Self {
         Self { rows, lanes: 32, streams, progress: None }
     }
@@ -40,26 +39,26 @@ impl CollectOptions<'_> {
 pub struct EpisodeResult {
     /// Sum of the rewards, undiscounted.
     pub episode_return: f64,
-    /// Steps.
+    /// Number of steps.
     pub length: usize,
-    /// Whether the episode was given up because the physics blew up.
+    /// Whether the episode was abandoned because the physics blew up.
     pub unstable: bool,
 }
 
-/// What the two kinds of rollout do with a step.
+/// How the two kinds of rollout handle a step.
 trait Lane: Send {
-    /// Takes note of a step (s, a, r, s') and says how to go on. `after` is s' and may be overwritten by a reset.
+    /// Handles a step (s, a, r, s') and returns how the lane continues. `after` is s'; a reset may overwrite it.
     fn advance(&mut self, env: &mut Env, step: Step<'_>, rng: &mut Rng) -> Next;
 }
 
-/// How a lane goes on.
+/// How a lane continues.
 #[derive(Clone, Copy, PartialEq)]
 enum Next {
-    /// With the episode's next step.
+    /// With the next step of the episode.
     Step,
-    /// With a new episode, which `after` is the first observation of.
+    /// With a new episode; `after` is its first observation.
     Episode,
-    /// Not at all.
+    /// It stops.
     Leave,
 }
 
@@ -70,7 +69,7 @@ struct Step<'a> {
     result: StepResult,
 }
 
-/// The lanes that still run, row by row: everything an actor needs lies contiguous.
+/// The lanes that are still running, in rows: all inputs of an actor are contiguous in memory.
 struct Lockstep<'a, A: Actor, L> {
     agent: Agent,
     actor: &'a A,
@@ -109,7 +108,7 @@ impl<'a, A: Actor, L: Lane> Lockstep<'a, A, L> {
         }
     }
 
-    /// One step of every lane. Lanes that are done leave, in their order, into `finished`.
+    /// Runs one step of every lane. Finished lanes are moved, in their order, to `finished`.
     fn tick(&mut self, finished: &mut Vec<L>) -> Result<(), SimError> {
         let (obs_dim, act_dim) = self.agent.dims();
         let actor = self.actor;
@@ -163,7 +162,7 @@ impl<'a, A: Actor, L: Lane> Lockstep<'a, A, L> {
     }
 }
 
-/// One lane of a collection: episodes one after another until the quota is reached.
+/// One lane of a collection: runs one episode after another until its quota is reached.
 struct Collector {
     index: u64,
     quota: usize,
@@ -186,7 +185,7 @@ impl Lane for Collector {
         let mut over = result.unstable;
         if result.unstable {
             self.unstable += 1;
-            // The episode ends with the row before, if it has one.
+            // The episode ends at the row before, if there is one.
             if self.steps > 0 {
                 *self.table.timeouts.last_mut().expect("this episode's rows") = true;
             }
@@ -211,14 +210,14 @@ impl Lane for Collector {
     }
 }
 
-/// Rolls `actor` out until there are `options.rows` transitions: lane by lane, in time order within a lane. The last
-/// episode of a lane is cut with a time-out mark. The same bytes at any number of threads.
+/// Rolls out `actor` until there are `options.rows` transitions, sorted by lane and in time order within a lane. The
+/// last episode of a lane is cut with a time-out mark. The bytes are the same at any number of threads.
 ///
-/// Steps in which the physics blew up are dropped (their episode ends with a time-out).
+/// Steps in which the physics blew up are dropped, and their episode ends with a time-out.
 ///
 /// # Errors
-/// If options are out of range, the actor returns a number that is not finite, the physics blow up again and again, or
-/// the user interrupts.
+/// If options are out of range, the actor returns a number that is not finite, the physics blow up repeatedly, or the
+/// user interrupts.
 pub fn collect<A: Actor>(
     agent: Agent,
     shift: Shift,
@@ -276,7 +275,7 @@ struct Evaluator {
 }
 
 impl Evaluator {
-    /// How the episode ended with this step, if it did.
+    /// How the episode ended at this step; `None` if it continues.
     fn ending(&self, step: StepResult) -> Option<Ending> {
         match step {
             StepResult { unstable: true, .. } => Some(Ending::Unstable),
@@ -306,12 +305,12 @@ impl Lane for Evaluator {
     }
 }
 
-/// Rolls out `episodes` whole episodes in lockstep and returns their outcomes in order. Random numbers come from the
-/// streams `evaluate/reset` and `evaluate/action`, indexed by episode: two policies evaluated with the same streams
-/// start from the same states. `stop` is asked before every step.
+/// Rolls out `episodes` whole episodes in lockstep and returns their results in order. Random numbers come from the
+/// streams `evaluate/reset` and `evaluate/action`, indexed by episode. Two policies evaluated with the same streams
+/// therefore start from the same states. `stop` is called before every step.
 ///
 /// # Errors
-/// If the actor returns a number that is not finite, or `stop` says so.
+/// If the actor returns a number that is not finite, or `stop` returns true.
 pub fn evaluate<A: Actor>(
     agent: Agent,
     shift: Shift,
@@ -324,10 +323,10 @@ pub fn evaluate<A: Actor>(
     Ok(lanes.into_iter().map(|lane| lane.result).collect())
 }
 
-/// [`evaluate`], with a recording of the first episode. Watching changes nothing: the outcomes are the same bits.
+/// [`evaluate`], with a recording of the first episode. The recording does not change the results.
 ///
 /// # Errors
-/// As [`evaluate`]; also if `episodes` is 0.
+/// As [`evaluate`], and if `episodes` is 0.
 pub fn evaluate_recorded<A: Actor>(
     agent: Agent,
     shift: Shift,

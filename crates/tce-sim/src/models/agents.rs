@@ -7,17 +7,17 @@ use super::robot::{Body, Contact, Geom, Integrator, Joint, JointKind, Motor, Rob
 const X: Vec3 = [1.0, 0.0, 0.0];
 const Y: Vec3 = [0.0, 1.0, 0.0];
 const Z: Vec3 = [0.0, 0.0, 1.0];
-/// Hopper's and Walker2d's leg joints turn about -y.
+/// Hopper's and Walker2d's leg joints rotate about -y.
 const MINUS_Y: Vec3 = [0.0, -1.0, 0.0];
 /// Earth's gravity along z, m/s^2.
 pub(super) const EARTH: f64 = -9.81;
 
-/// A range in degrees, in radians.
+/// Converts a range from degrees to radians.
 pub(super) fn degrees(low: f64, high: f64) -> [f64; 2] {
     [low.to_radians(), high.to_radians()]
 }
 
-/// The robot of `agent`, in the source domain.
+/// The robot description of `agent` in the source domain.
 pub fn robot(agent: Agent) -> Robot {
     match agent {
         Agent::HalfCheetah => half_cheetah(),
@@ -31,8 +31,8 @@ fn motors(joints: &[(&str, f64)]) -> Vec<Motor> {
     joints.iter().map(|&(joint, gear)| Motor { joint: joint.to_owned(), gear }).collect()
 }
 
-/// The three joints of a robot that moves in the x-z plane. With `height`, they lie on the floor below the torso, which
-/// makes the root's z coordinate the height of the torso; without it, z counts from the start.
+/// The three joints of a robot that moves in the x-z plane. With `height`, they are at the floor below the torso, so
+/// the root's z coordinate is the height of the torso. Without it, z is relative to the start.
 fn planar_root(torso: Body, height: f64) -> Body {
     let slide =
         |name, axis| Joint { position: [0.0, 0.0, -height], ..Joint::free_moving(name, JointKind::Slide, axis) };
@@ -162,8 +162,8 @@ fn walker2d() -> Robot {
 
 fn ant() -> Robot {
     const RADIUS: f64 = 0.08;
-    // Legs 1 and 2 are the front ones. The signs say in which quadrant of the x-y plane a leg lies; knees of opposite
-    // legs turn about parallel axes, so two of them bend towards negative angles.
+    // Legs 1 and 2 are the front ones. The signs give the quadrant of the x-y plane in which a leg lies. The knees of
+    // opposite legs rotate about parallel axes, so two of them bend towards negative angles.
     let leg = |number: usize, sx: f64, sy: f64, knee_sign: f64| {
         let knee_range = if knee_sign > 0.0 { degrees(30.0, 70.0) } else { degrees(-70.0, -30.0) };
         let hip_end = [0.2 * sx, 0.2 * sy, 0.0];

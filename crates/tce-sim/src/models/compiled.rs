@@ -10,13 +10,13 @@ use tce_data::{Agent, Shift};
 
 use crate::SimError;
 
-/// Models by robot and shift.
+/// Models, indexed by robot and shift.
 type Models = HashMap<(Agent, Shift), Arc<MjModel>>;
 
 /// The compiled model of `agent` under `shift`, shared by all environments of the process.
 ///
 /// # Errors
-/// If there is no MuJoCo 3.17.0, or if it refuses the model.
+/// If MuJoCo 3.17.0 is not available, or if it rejects the model.
 pub fn compiled(agent: Agent, shift: Shift) -> Result<Arc<MjModel>, SimError> {
     static MODELS: LazyLock<Mutex<Models>> = LazyLock::new(Default::default);
     static LOGGING: Once = Once::new();
@@ -26,7 +26,7 @@ pub fn compiled(agent: Agent, shift: Shift) -> Result<Arc<MjModel>, SimError> {
     }
     crate::library::open()?;
     LOGGING.call_once(|| {
-        // SAFETY: this crate uses MuJoCo only through models that come from here, so no thread uses it before the
+        // SAFETY: this crate uses MuJoCo only through models returned by this function, so no thread uses it before the
         // first call ends (the lock is held).
         unsafe {
             set_log_handler(report);
@@ -43,8 +43,8 @@ pub fn compiled(agent: Agent, shift: Shift) -> Result<Arc<MjModel>, SimError> {
     Ok(model)
 }
 
-/// MuJoCo would write its warnings to `MUJOCO_LOG.TXT` in the current directory. The one that can occur here (a
-/// simulation that blows up) is reported row by row through [`crate::StepResult::unstable`].
+/// Replaces MuJoCo's own handler, which would write warnings to `MUJOCO_LOG.TXT` in the current directory. The only
+/// possible warning here (an unstable simulation) is reported for each row in [`crate::StepResult::unstable`].
 fn report(message: &MjLogMessage) {
     if message.level() == MjtLogLevel::mjLOG_ERROR {
         tce_base::note!("MuJoCo: {}", message.subject());

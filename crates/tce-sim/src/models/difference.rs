@@ -1,4 +1,4 @@
-//! What a shift changed: two descriptions of one robot, compared part by part.
+//! Compares two descriptions of one robot part by part, to find what a shift changed.
 
 use std::collections::BTreeSet;
 
@@ -6,21 +6,21 @@ use tce_data::{Agent, Shift};
 
 use super::robot;
 
-/// What distinguishes a robot from the unshifted one.
+/// The differences between a shifted robot and the unshifted one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
-    /// Bodies with a geom of another size, shape or place within the body. A body that merely hangs elsewhere, because the one
-    /// before it has another length, is not meant: it is the same part.
+    /// Bodies with a geom of another size, shape or position within the body. A body that is only attached elsewhere,
+    /// because its parent has another length, does not count: it is the same part.
     pub reshaped: Vec<String>,
-    /// Bodies with a joint of another range, axis or place.
+    /// Bodies with a joint of another range, axis or position.
     pub restricted: Vec<String>,
-    /// The geoms of both.
+    /// The changed geoms, and all geoms of bodies with a changed joint.
     pub geoms: BTreeSet<String>,
     /// Gravity as a multiple of the source's.
     pub gravity: f64,
 }
 
-/// What `shift` changed of `agent`.
+/// The changes that `shift` makes to `agent`.
 pub fn difference(agent: Agent, shift: Shift) -> Difference {
     let (source, target) = (robot(agent, Shift::Source), robot(agent, shift));
     let mut old = Vec::new();

@@ -1,8 +1,8 @@
 //! Mass properties, as MuJoCo 2.1.0 and older computed them.
 //!
 //! The public data were made with such a version. It gave a capsule of radius r and cylinder length L the mass and
-//! inertia of a *cylinder* of radius r and length h = L + r (later versions use the exact capsule). Models therefore
-//! carry their inertia explicitly; without this, replayed transitions are wrong by 0.002 to 0.17.
+//! inertia of a *cylinder* of radius r and length h = L + r (later versions use the exact capsule). The models
+//! therefore specify their inertia explicitly. Otherwise replayed transitions are wrong by 0.002 to 0.17.
 
 use super::robot::{Body, Geom, Robot, Shape, Vec3};
 
@@ -35,7 +35,7 @@ fn symmetric_about(u: Vec3, perpendicular: f64, axial: f64) -> [[f64; 3]; 3] {
     })
 }
 
-/// Mass properties of one geom of the given density: of a sphere, or of the cylinder that stands for a capsule.
+/// Mass properties of one geom of the given density: of a sphere, or of the cylinder that replaces a capsule.
 pub fn of_geom(geom: &Geom, density: f64) -> MassProperties {
     let r = geom.radius;
     let (length, centre, axis) = match geom.shape {
@@ -57,7 +57,7 @@ pub fn of_geom(geom: &Geom, density: f64) -> MassProperties {
     MassProperties { mass, centre, inertia }
 }
 
-/// Mass properties of a body's geoms together (parallel-axis theorem).
+/// Combined mass properties of a body's geoms (parallel-axis theorem).
 pub fn of_body(body: &Body, density: f64) -> MassProperties {
     let parts: Vec<_> = body.geoms.iter().map(|g| of_geom(g, density)).collect();
     let mass = parts.iter().map(|p| p.mass).sum::<f64>();
@@ -75,7 +75,7 @@ pub fn of_body(body: &Body, density: f64) -> MassProperties {
     MassProperties { mass, centre, inertia }
 }
 
-/// The factor by which masses and inertias are scaled to reach the robot's total mass.
+/// The factor for masses and inertias that gives the robot its total mass.
 pub fn scale(robot: &Robot) -> f64 {
     let Some(total) = robot.total_mass else { return 1.0 };
     let mut mass = 0.0;
@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn both_ways_to_place_a_capsule_agree() {
-        // Turned by 90 degrees about y, the z axis points along x.
+        // After a rotation by 90 degrees about y, the z axis points along x.
         let tilted = of_geom(&Geom::tilted("g", 0.1, 0.5, [0.3, 0.0, 0.0], std::f64::consts::FRAC_PI_2), 1.0);
         let segment = of_geom(&Geom::segment("g", 0.1, [-0.2, 0.0, 0.0], [0.8, 0.0, 0.0]), 1.0);
         close(tilted.mass, segment.mass);
@@ -131,8 +131,8 @@ mod tests {
 
     #[test]
     fn two_geoms_combine_by_the_parallel_axis_theorem() {
-        // Two equal cylinders along x whose centres lie at x = -1 and x = +1: the axial moment doubles, the others gain
-        // 2 m d^2 with d = 1.
+        // Two equal cylinders along x with centres at x = -1 and x = +1: the axial moment doubles, the other two
+        // increase by 2 m d^2 with d = 1.
         let one = |x: f64| Geom::segment("g", 0.1, [x - 0.2, 0.0, 0.0], [x + 0.2, 0.0, 0.0]);
         let single = of_geom(&one(0.0), 10.0);
         let mut body = Body::new("b", [0.0; 3], one(-1.0));

@@ -1,11 +1,11 @@
-//! A robot's description as MJCF, MuJoCo's XML.
+//! Writes a robot's description as MJCF, MuJoCo's XML format.
 
 use std::fmt::Write;
 
 use super::inertia;
 use super::robot::{Body, Geom, Integrator, Joint, JointKind, Robot, Shape};
 
-/// Numbers as MJCF writes them. Rust prints the shortest text that reads back as the same number.
+/// Formats numbers for MJCF. Rust prints the shortest text that parses to the same number.
 fn list(numbers: &[f64]) -> String {
     let texts: Vec<String> = numbers.iter().map(f64::to_string).collect();
     texts.join(" ")
@@ -69,8 +69,8 @@ fn contact(robot: &Robot, geom: Option<&Geom>) -> String {
         list(&[sliding, torsional, rolling])
     );
     if contact.margin > 0.0 {
-        // MuJoCo up to 3.4 took the larger margin of two geoms, later versions add them. Every geom has the same one,
-        // so half of it gives the contact distance of old.
+        // MuJoCo up to 3.4 used the larger margin of two geoms, later versions add both. Every geom has the same
+        // margin, so half of it gives the original contact distance.
         write!(out, " margin=\"{}\"", contact.margin / 2.0).expect("writing to a string");
     }
     if let Some((solimp, solref)) = contact.solver {
@@ -83,7 +83,7 @@ fn write_body(xml: &mut String, depth: usize, robot: &Robot, body: &Body, scale:
     line(xml, depth, &format!("<body name=\"{}\" pos=\"{}\">", body.name, list(&body.position)));
     let p = inertia::of_body(body, robot.density);
     let i = p.inertia;
-    // Rounding residues would only cloud the text.
+    // Rounding residues are set to zero to keep the text readable.
     let largest = i[0][0].max(i[1][1]).max(i[2][2]);
     let clean = |x: f64| if x.abs() < 1e-15 * largest { 0.0 } else { x * scale };
     let full = [i[0][0], i[1][1], i[2][2], i[0][1], i[0][2], i[1][2]].map(clean);

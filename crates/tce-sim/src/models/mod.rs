@@ -1,4 +1,4 @@
-//! The twenty models: one description per robot, an edit per shift, MJCF generated from both.
+//! The twenty models: one description per robot and one edit per shift; the MJCF is generated from both.
 
 mod agents;
 mod compiled;

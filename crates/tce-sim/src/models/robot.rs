@@ -1,9 +1,9 @@
-//! What a robot is: a tree of bodies with joints and geoms, and motors on its joints. SI units; angles in radians.
+//! The description of a robot: a tree of bodies with joints, geoms and motors. SI units; angles in radians.
 
 /// A point or direction in a body's frame.
 pub type Vec3 = [f64; 3];
 
-/// How MuJoCo advances time.
+/// MuJoCo's time integration methods.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Integrator {
     /// Semi-implicit Euler.
@@ -12,7 +12,7 @@ pub enum Integrator {
     Rk4,
 }
 
-/// A whole robot on a floor.
+/// A complete robot on a floor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Robot {
     /// Name of the MuJoCo model.
@@ -25,11 +25,11 @@ pub struct Robot {
     pub gravity: f64,
     /// Mass density of every geom, kg/m^3.
     pub density: f64,
-    /// If set, all masses and inertias are scaled so that the robot weighs this, kg.
+    /// If set, all masses and inertias are scaled so that the robot has this total mass, kg.
     pub total_mass: Option<f64>,
     /// Contact properties of every geom.
     pub contact: Contact,
-    /// Solver parameters (solimp, solref) of the joint limits, where they are not MuJoCo's own.
+    /// Solver parameters (solimp, solref) of the joint limits, if they differ from MuJoCo's defaults.
     pub limit_solver: Option<([f64; 3], [f64; 2])>,
     /// The root of the tree.
     pub torso: Body,
@@ -37,38 +37,38 @@ pub struct Robot {
     pub motors: Vec<Motor>,
 }
 
-/// Contact properties shared by the geoms of a robot; the floor has them too, except `between_bodies` and `condim`.
+/// Contact properties of all geoms of a robot. They also apply to the floor, except `between_bodies` and `condim`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// Whether the robot's own geoms can touch each other, and not the floor alone.
+    /// Whether the robot's geoms can also touch each other, not only the floor.
     pub between_bodies: bool,
-    /// Contact dimensions of the robot's geoms (1: frictionless, 3: sliding friction); the floor has 3.
+    /// Contact dimensions of the robot's geoms (1: frictionless, 3: sliding friction); the floor always has 3.
     pub condim: u32,
-    /// Distance at which a contact becomes active, m, as the environments were written: for a MuJoCo that takes the
-    /// *larger* margin of two geoms.
+    /// Distance at which a contact becomes active, m. The value is that of the original environments, for a MuJoCo
+    /// version that uses the *larger* margin of two geoms.
     pub margin: f64,
-    /// Sliding, torsional and rolling friction; a geom may have a sliding friction of its own.
+    /// Sliding, torsional and rolling friction. A geom may override the sliding friction.
     pub friction: [f64; 3],
-    /// Solver parameters (solimp, solref), where they are not MuJoCo's own.
+    /// Solver parameters (solimp, solref), if they differ from MuJoCo's defaults.
     pub solver: Option<([f64; 3], [f64; 2])>,
 }
 
-/// A rigid body and what hangs on it.
+/// A rigid body and its child bodies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Body {
     /// Unique name.
     pub name: String,
     /// Origin in the parent's frame, m.
     pub position: Vec3,
-    /// Degrees of freedom against the parent; none: welded.
+    /// Degrees of freedom relative to the parent; empty if it is welded to the parent.
     pub joints: Vec<Joint>,
     /// Shapes.
     pub geoms: Vec<Geom>,
-    /// Bodies further out.
+    /// Child bodies.
     pub children: Vec<Body>,
 }
 
-/// The kinds of joint.
+/// Kinds of joints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JointKind {
     /// Six degrees of freedom.
@@ -92,9 +92,9 @@ pub struct Joint {
     pub position: Vec3,
     /// The coordinate's value in the model's rest configuration.
     pub reference: f64,
-    /// Limits of the coordinate, rad; none: unlimited.
+    /// Limits of the coordinate, rad; `None`: unlimited.
     pub range: Option<[f64; 2]>,
-    /// Rotor inertia added to the joint's own.
+    /// Rotor inertia added to the joint's inertia.
     pub armature: f64,
     /// Viscous damping.
     pub damping: f64,
@@ -102,10 +102,10 @@ pub struct Joint {
     pub stiffness: f64,
 }
 
-/// The shapes in use.
+/// Shapes of geoms.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
-    /// A sphere about the body's origin.
+    /// A sphere at the body's origin.
     Sphere,
     /// A capsule between two points (the centres of its caps).
     Segment {
@@ -114,7 +114,7 @@ pub enum Shape {
         /// The other end, m.
         to: Vec3,
     },
-    /// A capsule given by its centre and the angle by which its axis is turned from z about y.
+    /// A capsule given by its centre and the rotation of its axis from z about y.
     Tilted {
         /// Centre, m.
         centre: Vec3,
@@ -134,7 +134,7 @@ pub struct Geom {
     pub radius: f64,
     /// Shape and placement.
     pub shape: Shape,
-    /// Sliding friction, where it differs from the robot's.
+    /// Sliding friction, if it differs from the robot's.
     pub sliding_friction: Option<f64>,
 }
 
@@ -148,24 +148,24 @@ pub struct Motor {
 }
 
 impl Body {
-    /// A body without joints and children around one geom of the same name.
+    /// A body with one geom of the same name, without joints and children.
     pub fn new(name: &str, position: Vec3, geom: Geom) -> Self {
         Self { name: name.to_owned(), position, joints: Vec::new(), geoms: vec![geom], children: Vec::new() }
     }
 
-    /// The same with a joint more.
+    /// Adds a joint.
     pub fn joint(mut self, joint: Joint) -> Self {
         self.joints.push(joint);
         self
     }
 
-    /// The same with a child more.
+    /// Adds a child body.
     pub fn child(mut self, child: Body) -> Self {
         self.children.push(child);
         self
     }
 
-    /// The body of that name in this tree.
+    /// The body of that name in this subtree.
     fn find(&mut self, name: &str) -> Option<&mut Body> {
         if self.name == name {
             return Some(self);
@@ -205,18 +205,18 @@ impl Joint {
 }
 
 impl Geom {
-    /// A capsule of radius `radius` from `from` to `to`.
+    /// A capsule of the given `radius` from `from` to `to`.
     pub fn segment(name: &str, radius: f64, from: Vec3, to: Vec3) -> Self {
         Self { name: name.to_owned(), radius, shape: Shape::Segment { from, to }, sliding_friction: None }
     }
 
-    /// A capsule about `centre`, its axis turned by `tilt` about y.
+    /// A capsule with the given `centre`, its axis rotated by `tilt` about y.
     pub fn tilted(name: &str, radius: f64, half_length: f64, centre: Vec3, tilt: f64) -> Self {
         let shape = Shape::Tilted { centre, half_length, tilt };
         Self { name: name.to_owned(), radius, shape, sliding_friction: None }
     }
 
-    /// The same with a sliding friction of its own.
+    /// Sets the geom's own sliding friction.
     pub fn friction(mut self, sliding: f64) -> Self {
         self.sliding_friction = Some(sliding);
         self
@@ -227,12 +227,12 @@ impl Robot {
     /// The body of that name.
     ///
     /// # Panics
-    /// If there is none: names are constants of this crate.
+    /// If there is no such body: names are constants of this crate.
     pub fn body_mut(&mut self, name: &str) -> &mut Body {
         self.torso.find(name).unwrap_or_else(|| panic!("no body named {name}"))
     }
 
-    /// The limits of the joint of the body of the same name.
+    /// The limits of the joint `name` in the body of the same name.
     ///
     /// # Panics
     /// If there is no such body, or its joint has another name.
@@ -241,7 +241,7 @@ impl Robot {
         &mut joint.unwrap_or_else(|| panic!("body {name} has no joint {name}")).range
     }
 
-    /// The first geom of the body of that name.
+    /// The first geom of the given body.
     ///
     /// # Panics
     /// If there is no such body.

@@ -1,14 +1,14 @@
 //! The dynamics shifts of the benchmark, as edits of a robot's description.
 //!
-//! Where the paper's prose and the public data disagree, the data are followed: every alternative was tried against
-//! them and rejected by orders of magnitude (`shared/reference/environments.md`).
+//! Where the paper's text and the public data disagree, this code follows the data: every alternative was tested
+//! against them, and its errors were larger by orders of magnitude (`shared/reference/environments.md`).
 
 use tce_data::{Agent, Shift};
 
 use super::agents::{EARTH, degrees};
 use super::robot::{Geom, Robot, Shape, Vec3};
 
-/// Turns the unshifted robot of `agent` into that of the target domain.
+/// Changes the unshifted robot of `agent` into the robot of the target domain.
 pub fn apply(agent: Agent, shift: Shift, robot: &mut Robot) {
     match shift {
         Shift::Source => {}
@@ -19,7 +19,7 @@ pub fn apply(agent: Agent, shift: Shift, robot: &mut Robot) {
     }
 }
 
-/// Lets the capsule of `body` run from the body's origin to `end`, and hangs `next` there.
+/// Makes the capsule of `body` run from the body's origin to `end`, and attaches `next` at `end`.
 fn reshape(robot: &mut Robot, body: &str, end: Vec3, next: Option<&str>) {
     robot.geom_mut(body).shape = Shape::Segment { from: [0.0; 3], to: end };
     if let Some(next) = next {
@@ -29,22 +29,22 @@ fn reshape(robot: &mut Robot, body: &str, end: Vec3, next: Option<&str>) {
 
 fn morph(agent: Agent, robot: &mut Robot) {
     match agent {
-        // Thighs of next to no length; the shins are straight capsules between the joints.
+        // Thighs of almost no length; the shins are straight capsules between the joints.
         Agent::HalfCheetah => {
             reshape(robot, "bthigh", [-0.0001, 0.0, -0.0001], Some("bshin"));
             reshape(robot, "bshin", [-0.13, 0.0, -0.15], Some("bfoot"));
             reshape(robot, "fthigh", [0.0001, 0.0, 0.0001], Some("fshin"));
             reshape(robot, "fshin", [0.01, 0.0, -0.16], Some("ffoot"));
-            // The hind foot keeps its place but is as short as the front one.
+            // The hind foot keeps its position but is as short as the front one.
             let foot = robot.geom_mut("bfoot");
             *foot = Geom::tilted("bfoot", foot.radius, 0.07, [0.03, 0.0, -0.097], -0.27);
         }
-        // A big head on a thin thigh.
+        // A larger torso and a thinner thigh.
         Agent::Hopper => {
             robot.geom_mut("torso").radius = 0.125;
             robot.geom_mut("thigh").radius = 0.04;
         }
-        // The right thigh all but vanishes, the right leg takes over half of its length.
+        // The right thigh has almost no length. The right leg is longer by half of the thigh's length.
         Agent::Walker2d => {
             reshape(robot, "thigh", [0.0, 0.0, -0.005], Some("leg"));
             reshape(robot, "leg", [0.0, 0.0, -0.745], Some("foot"));
@@ -64,7 +64,7 @@ fn kinematic(agent: Agent, robot: &mut Robot) {
             *robot.range_mut("thigh") = Some(degrees(-0.15, 0.0));
             *robot.range_mut("foot") = Some(degrees(-18.0, 18.0));
         }
-        // The right foot only.
+        // Only the right foot.
         Agent::Walker2d => *robot.range_mut("foot") = Some(degrees(-0.45, 0.45)),
         Agent::Ant => {
             *robot.range_mut("hip_1") = Some(degrees(-0.3, 0.3));

@@ -1,5 +1,5 @@
-//! Videos of recorded episodes, side by side. Everything is drawn here, on the CPU, from the coordinates: no OpenGL, no screen, and
-//! the same recordings give the same pixels.
+//! Videos of recorded episodes, side by side. All drawing is done here on the CPU, from the coordinates: without OpenGL
+//! and without a screen. The same recordings give the same pixels.
 
 mod camera;
 mod picture;
@@ -22,9 +22,9 @@ use text::Style;
 
 pub use picture::{Colour, Picture};
 
-/// Seconds that a picture is shown, about: 25 pictures a second.
+/// Approximate duration of a picture in seconds: 25 pictures per second.
 const INTERVAL: f64 = 0.04;
-/// Seconds for which the last picture stays, so that it can be read before the video begins anew.
+/// Duration of the last picture in seconds, so that it can be read before the video restarts.
 const HOLD: f64 = 1.0;
 /// Pixels between two panels.
 const GAP: usize = 2;
@@ -33,7 +33,7 @@ const INK: Colour = [38, 44, 56];
 const FAINT: Colour = [92, 100, 114];
 const ALARM: Colour = [196, 40, 40];
 
-/// How a video is made.
+/// Options of a video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VideoOptions {
     /// Width and height of a panel, pixels.
@@ -50,7 +50,7 @@ impl Default for VideoOptions {
     }
 }
 
-/// A video, ready to be drawn picture by picture, in any order.
+/// A video whose pictures can be drawn one by one, in any order.
 pub struct Video {
     panels: Vec<Panel>,
     size: [usize; 2],
@@ -62,21 +62,21 @@ pub struct Video {
 struct Panel {
     recording: Recording,
     reference: Option<ReferenceScores>,
-    /// Torso and parts in every picture until the episode's last.
+    /// Torso and parts in every picture up to the end of the episode.
     poses: Vec<(Vec3, Vec<Solid>)>,
-    /// What the shift changed; empty where nothing is.
+    /// The changes made by the shift; empty if there are none.
     legend: Vec<String>,
 }
 
 impl Video {
-    /// A video of one robot's episodes, from left to right. It ends a second after the longest of them, or after
-    /// [`VideoOptions::seconds`].
+    /// A video of one robot's episodes, arranged from left to right. It ends a second after the longest of them, or
+    /// after [`VideoOptions::seconds`].
     ///
     /// # Errors
-    /// If a model cannot be compiled, which it was for the recording.
+    /// If a model cannot be compiled (the recording has already compiled it).
     ///
     /// # Panics
-    /// Without recordings.
+    /// If there are no recordings.
     pub fn new(recordings: Vec<Recording>, options: VideoOptions) -> Result<Self, SimError> {
         let first = &recordings[0];
         let dt = seconds_per_step(first.agent, &*compiled(first.agent, first.shift)?);
@@ -89,17 +89,17 @@ impl Video {
         Ok(Self { panels, size: options.size, frames, stride, interval })
     }
 
-    /// Pictures.
+    /// Number of pictures.
     pub fn frames(&self) -> usize {
         self.frames
     }
 
-    /// Seconds for which a picture is shown.
+    /// Duration of a picture in seconds.
     pub fn interval(&self) -> f64 {
         self.interval
     }
 
-    /// Steps of the episodes from one picture to the next.
+    /// Number of episode steps between two pictures.
     pub fn stride(&self) -> usize {
         self.stride
     }
@@ -109,12 +109,12 @@ impl Video {
         self.panels.iter().map(|panel| &panel.recording)
     }
 
-    /// The steps of the longest episode.
+    /// Number of steps of the longest episode.
     pub fn longest(&self) -> usize {
         self.recordings().map(Recording::length).max().expect("a recording")
     }
 
-    /// The steps that are shown of it.
+    /// Number of steps of the longest episode that are shown.
     pub fn steps(&self) -> usize {
         self.longest().min((self.frames - 1) * self.stride)
     }
@@ -125,7 +125,7 @@ impl Video {
         [panels * self.size[0] + (panels - 1) * GAP, self.size[1]]
     }
 
-    /// The picture number `frame`, from 0.
+    /// Draws picture number `frame`, counted from 0.
     pub fn draw(&self, frame: usize) -> Picture {
         let [width, height] = self.size();
         let mut picture = Picture::new(width, height, [255; 3]);

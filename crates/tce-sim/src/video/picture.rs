@@ -1,4 +1,4 @@
-//! Pixels.
+//! Pictures made of pixels.
 
 /// Red, green, blue.
 pub type Colour = [u8; 3];
@@ -15,17 +15,17 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// A picture of one colour.
+    /// A picture filled with one colour.
     pub fn new(width: usize, height: usize, colour: Colour) -> Self {
         Self { width, height, pixels: vec![colour; width * height] }
     }
 
-    /// The pixel in column `x` of row `y`.
+    /// The pixel in column `x` and row `y`.
     pub fn pixel(&self, x: usize, y: usize) -> Colour {
         self.pixels[y * self.width + x]
     }
 
-    /// Lays `colour` over a pixel, opaque at 255; nothing outside of the picture.
+    /// Blends `colour` over a pixel; an opacity of 255 is opaque. Pixels outside the picture are ignored.
     pub(super) fn blend(&mut self, x: usize, y: usize, colour: Colour, opacity: u8) {
         if x < self.width && y < self.height {
             let pixel = &mut self.pixels[y * self.width + x];
@@ -33,7 +33,7 @@ impl Picture {
         }
     }
 
-    /// Fills a rectangle, as far as it lies in the picture.
+    /// Fills the part of a rectangle that lies in the picture.
     pub(super) fn fill(&mut self, [x, y]: [usize; 2], [width, height]: [usize; 2], colour: Colour) {
         for row in y..(y + height).min(self.height) {
             let start = row * self.width;
@@ -41,7 +41,7 @@ impl Picture {
         }
     }
 
-    /// Copies `other` here, with its top left corner at (`x`, 0). It must fit.
+    /// Copies `other` into this picture, with its top left corner at (`x`, 0). It must fit.
     pub(super) fn paste(&mut self, other: &Picture, x: usize) {
         for (row, pixels) in other.pixels.chunks_exact(other.width).enumerate() {
             let start = row * self.width + x;
@@ -50,7 +50,7 @@ impl Picture {
     }
 }
 
-/// `a` at 0, `b` at 1.
+/// Mixes two colours: `a` at 0, `b` at 1.
 pub(super) fn mix(a: Colour, b: Colour, share: f64) -> Colour {
     std::array::from_fn(|i| (f64::from(a[i]) + share * (f64::from(b[i]) - f64::from(a[i]))).round() as u8)
 }

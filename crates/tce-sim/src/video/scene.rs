@@ -1,8 +1,8 @@
-//! Casts rays at capsules on a chequered ground.
+//! Renders capsules on a chequered floor by ray casting.
 //!
-//! What is nearest along a ray is seen, at every point by itself: limbs that cross or meet in a joint cover each other where they
-//! do, which painting whole limbs from back to front cannot give. Every pixel is looked at through four points, so that edges are
-//! smooth.
+//! The nearest surface along a ray is visible, decided separately for every sample point. So limbs that cross or meet
+//! in a joint hide each other correctly, which painting whole limbs from back to front cannot achieve. Every pixel has
+//! four sample points, so that edges are smooth.
 
 use crate::models::inertia::{dot, minus};
 use crate::models::robot::Vec3;
@@ -11,13 +11,13 @@ use super::camera::{Camera, Floor, along, unit};
 use super::picture::{Colour, Picture, mix};
 use super::solid::{Paint, Solid};
 
-/// Points within a pixel, a rotated square: edges near the horizontal and the vertical meet all four one after the other.
+/// Sample points within a pixel, a rotated square: nearly horizontal or vertical edges cross them one after another.
 const POINTS: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
-/// Where the light comes from: above, before and to the left.
+/// Direction towards the light: above, in front and to the left.
 const LIGHT: Vec3 = [-0.35, -0.55, 0.9];
-/// Steps of light on a surface. Few, so that a video gets by with the colours of a GIF.
+/// Number of shades of a surface. It is small, so that the colours of a GIF are enough for a video.
 const SHADES: usize = 7;
-/// Steps in which the ground fades into the sky.
+/// Number of steps in which the floor fades into the sky.
 const FADES: usize = 16;
 /// Thickness of an outline, pixels.
 const OUTLINE: f64 = 1.3;
@@ -28,7 +28,7 @@ const SHADOW: Colour = [60, 68, 82];
 
 /// The colour of a paint in full light.
 pub(super) fn colour(paint: Paint) -> Colour {
-    // Okabe and Ito's blue, green and vermilion, which the colour-blind can tell apart, too.
+    // Okabe and Ito's blue, green and vermilion, which colour-blind people can also distinguish.
     match paint {
         Paint::Torso => [128, 138, 152],
         Paint::Right => [30, 136, 205],
@@ -37,7 +37,7 @@ pub(super) fn colour(paint: Paint) -> Colour {
     }
 }
 
-/// Draws `solids` as `camera` sees them.
+/// Draws `solids` as seen by `camera`.
 pub(super) fn draw(camera: &Camera, solids: &[Solid], floor: Floor, [width, height]: [usize; 2]) -> Picture {
     let mut samples = ground(camera, solids, floor, width, height);
     let mut depths = vec![f64::INFINITY; samples.len()];
@@ -46,7 +46,7 @@ pub(super) fn draw(camera: &Camera, solids: &[Solid], floor: Floor, [width, heig
         let Some([columns, rows]) = bounds(camera, solid, width, height) else { continue };
         let shades = shades(solid.paint);
         let body = Seen::new(camera, solid, solid.radius);
-        // A pixel wider all around: what its middle misses, none of its points meets.
+        // One pixel larger: if a pixel's central ray misses it, the rays of all its sample points miss the solid.
         let around = Seen::new(camera, solid, solid.radius + 1.0 / body.scale);
         for y in rows {
             for x in columns.clone() {
@@ -57,10 +57,10 @@ pub(super) fn draw(camera: &Camera, solids: &[Solid], floor: Floor, [width, heig
                     let ray = camera.ray(x as f64 + dx, y as f64 + dy);
                     let Some(Hit { depth, normal, facing }) = body.hit(ray) else { continue };
                     let at = 4 * (y * width + x) + k;
-                    // What is below the ground, by a little in every step, stays hidden as on a real floor.
+                    // Limbs sink slightly below the ground in every step; that part stays hidden.
                     if depth < depths[at] && camera.position[2] + depth * ray[2] > -1e-3 {
                         depths[at] = depth;
-                        // The outline is where the surface turns away from the eye.
+                        // The outline is where the surface is almost parallel to the ray.
                         let lit = || 0.5 + 0.5 * dot(normal, light);
                         samples[at] = shades[if facing < body.rim { 0 } else { shade(lit()) }];
                     }
@@ -83,31 +83,31 @@ fn shades(paint: Paint) -> [Colour; SHADES] {
     })
 }
 
-/// Which shade a surface has by its light, from 0 to 1.
+/// The shade of a surface for its amount of light, from 0 to 1.
 fn shade(lit: f64) -> usize {
     1 + ((lit * (SHADES - 1) as f64) as usize).min(SHADES - 2)
 }
 
-/// Where a ray enters a solid.
+/// The point where a ray enters a solid.
 struct Hit {
-    /// How far along the ray.
+    /// Distance along the ray.
     depth: f64,
-    /// The surface's direction.
+    /// The surface normal.
     normal: Vec3,
-    /// The cosine of the angle between surface and ray; on the wall of a cylinder as seen along its axis, or one that points at the
-    /// eye would be outline all over.
+    /// The cosine of the angle between normal and ray. On the wall of a cylinder, the ray is projected along its axis;
+    /// otherwise a cylinder that points at the camera would be all outline.
     facing: f64,
 }
 
-/// A solid as seen from the camera's place.
+/// A solid relative to the camera's position.
 struct Seen {
     /// Ends, relative to the camera.
     ends: [Vec3; 2],
-    /// Unit vector from the first end to the second, and the distance; zero for spheres.
+    /// Unit vector from the first end to the second, and their distance; zero for spheres.
     axis: Vec3,
     length: f64,
     radius: f64,
-    /// The cosine between surface and ray at which the outline begins.
+    /// The value of `facing` at which the outline begins.
     rim: f64,
     /// Pixels per metre at the farther end.
     scale: f64,
@@ -120,12 +120,12 @@ impl Seen {
         let length = dot(way, way).sqrt();
         let axis = if length > 0.0 { way.map(|x| x / length) } else { [0.0; 3] };
         let [a, b] = ends.map(|end| dot(end, end).sqrt());
-        // Across a round body of r pixels, the surface w pixels before its edge has the cosine sqrt(1 - (1 - w / r)^2).
+        // On a round body of r pixels, the surface w pixels from its edge has the cosine sqrt(1 - (1 - w / r)^2).
         let inner = (1.0 - OUTLINE / (radius * camera.scale(a.min(b)))).max(0.5);
         Self { ends, axis, length, radius, rim: (1.0 - inner * inner).sqrt(), scale: camera.scale(a.max(b)) }
     }
 
-    /// Where a ray from the camera enters. A capsule is two spheres and the wall of a cylinder between them.
+    /// The point where a ray from the camera enters. A capsule is two spheres and the wall of a cylinder between them.
     fn hit(&self, ray: Vec3) -> Option<Hit> {
         let mut nearest: Option<Hit> = None;
         let mut offer = |depth: f64, centre: Vec3, gaze: Vec3| {
@@ -143,7 +143,7 @@ impl Seen {
                 return nearest;
             }
         }
-        // Along the axis the cylinder is a circle.
+        // Projected along its axis, the cylinder is a circle.
         let across = |v: Vec3| along(v, -dot(v, self.axis), self.axis);
         let gaze = across(ray);
         if let Some(depth) = entry(gaze, across(self.ends[0]), self.radius) {
@@ -156,20 +156,20 @@ impl Seen {
     }
 }
 
-/// The smaller t at which `t ray` is at the distance `radius` from `centre`.
+/// The smaller t for which `t ray` has the distance `radius` from `centre`.
 fn entry(ray: Vec3, centre: Vec3, radius: f64) -> Option<f64> {
     let (a, b, c) = (dot(ray, ray), dot(ray, centre), dot(centre, centre) - radius * radius);
     let d = b * b - a * c;
     (d >= 0.0 && a > 1e-12).then(|| (b - d.sqrt()) / a)
 }
 
-/// The columns and rows of the picture in which a solid can be seen.
+/// The columns and rows of the picture in which a solid may be visible.
 fn bounds(camera: &Camera, solid: &Solid, width: usize, height: usize) -> Option<[std::ops::Range<usize>; 2]> {
     let mut low = [f64::INFINITY; 2];
     let mut high = [f64::NEG_INFINITY; 2];
     for end in solid.ends {
         let (at, depth) = camera.project(end)?;
-        // A sphere's outline reaches beyond its radius at the centre's depth, by less than this.
+        // The outline of a sphere reaches beyond its radius at the centre's depth, by less than this.
         let reach = 1.5 * solid.radius * camera.scale((depth - solid.radius).max(0.1)) + 1.0;
         for i in 0..2 {
             low[i] = low[i].min(at[i] - reach);
@@ -184,12 +184,12 @@ fn bounds(camera: &Camera, solid: &Solid, width: usize, height: usize) -> Option
     (!columns.is_empty() && !rows.is_empty()).then_some([columns, rows])
 }
 
-/// Sky and ground with the shadows of light from straight above, which show how high a foot is: four samples a pixel.
+/// Draws sky and ground with four samples per pixel. Shadows fall straight down and so show how high a foot is.
 ///
-/// The camera stands upright, so that all points of a row that lie on the ground are equally deep: what costs is worked out once a
+/// The camera has no roll, so all ground points of a row have the same depth. Expensive values are computed once per
 /// row.
 fn ground(camera: &Camera, solids: &[Solid], floor: Floor, width: usize, height: usize) -> Vec<Colour> {
-    // Odd squares, then both in the shadow.
+    // The two colours of squares, then both in the shadow.
     let tones: Vec<[Colour; 4]> = (0..=FADES)
         .map(|k| {
             std::array::from_fn(|i| {
@@ -211,7 +211,7 @@ fn ground(camera: &Camera, solids: &[Solid], floor: Floor, width: usize, height:
             let tones = &tones[(fade * FADES as f64).round() as usize];
             let start: [f64; 2] = std::array::from_fn(|i| camera.position[i] + depth * first[i]);
             let step: [f64; 2] = std::array::from_fn(|i| depth * (next[i] - first[i]));
-            // Far from zero, so that cutting off what is behind the point rounds down.
+            // A large even number of squares makes the value positive, so that truncation rounds down.
             let even = 2.0 * (1u64 << 24) as f64;
             for x in 0..width {
                 let p: [f64; 2] = std::array::from_fn(|i| start[i] + x as f64 * step[i]);
@@ -225,7 +225,7 @@ fn ground(camera: &Camera, solids: &[Solid], floor: Floor, width: usize, height:
     samples
 }
 
-/// The least and the greatest x and y of some solids.
+/// The smallest and the largest x and y of some solids.
 fn extent(solids: &[Solid]) -> [[f64; 2]; 2] {
     let mut out = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
     for (end, radius) in solids.iter().flat_map(|s| s.ends.map(|end| (end, s.radius))) {
@@ -237,7 +237,7 @@ fn extent(solids: &[Solid]) -> [[f64; 2]; 2] {
     out
 }
 
-/// Whether a solid is straight above a point of the ground.
+/// Whether a solid is vertically above a point of the ground.
 fn below(solid: &Solid, p: [f64; 2]) -> bool {
     let [a, b] = solid.ends;
     let (way, to) = ([b[0] - a[0], b[1] - a[1]], [p[0] - a[0], p[1] - a[1]]);
@@ -254,7 +254,7 @@ mod tests {
     const SIZE: [usize; 2] = [160, 120];
     const FLOOR: Floor = Floor { square: 0.5, fade: 5.5 };
 
-    /// 4 m away, 30 pixels per metre.
+    /// A camera at a distance of 4 m, with 30 pixels per metre.
     fn camera() -> Camera {
         Camera::new([0.0, -4.0, 2.0], [0.0, 0.0, 2.0], 4.0, SIZE)
     }
@@ -263,7 +263,7 @@ mod tests {
         Solid { ends: [from, to], radius, paint }
     }
 
-    /// The paint that a pixel's colour is nearest to; none for sky and ground.
+    /// The paint whose colours are nearest to that of a pixel; `None` for sky and ground.
     fn seen(picture: &Picture, x: usize, y: usize) -> Option<Paint> {
         let paints = [Paint::Torso, Paint::Right, Paint::Left, Paint::Changed].map(|p| (Some(p), shades(p).to_vec()));
         let behind = (None, vec![SKY, GROUND[0], GROUND[1]]);
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn a_capsule_covers_the_pixels_that_it_should() {
-        // From 1 m left to 1 m right of the middle, 0.2 m thick: columns 50 to 110 and the caps' 6 pixels more, rows 54 to 66.
+        // From 1 m left to 1 m right, 0.2 m thick: columns 50 to 110 and 6 more pixels per cap, rows 54 to 66.
         let bar = solid([-1.0, 0.0, 2.0], [1.0, 0.0, 2.0], 0.2, Paint::Left);
         let picture = draw(&camera(), &[bar], FLOOR, SIZE);
         let covered = |x, y| shows(&picture, x, y, Paint::Left);
@@ -292,7 +292,7 @@ mod tests {
             assert!(!covered(x, y), "({x}, {y}) is outside");
         }
         let area = (0..SIZE[0] * SIZE[1]).filter(|k| covered(k % SIZE[0], k / SIZE[0])).count() as f64;
-        // A stadium: 60 by 12, and a circle of radius 6.
+        // The area of a stadium: 60 by 12, and a circle of radius 6.
         let whole = 60.0 * 12.0 + std::f64::consts::PI * 36.0;
         assert!((0.9 * whole..1.1 * whole).contains(&area), "{area} of {whole}");
     }
@@ -305,7 +305,7 @@ mod tests {
         assert!(one == draw(&camera(), &[near, far], FLOOR, SIZE));
         assert!(shows(&one, 80, 60, Paint::Right));
         assert!(shows(&one, 60, 60, Paint::Left) && shows(&one, 100, 60, Paint::Left));
-        // One that runs from before to behind another is covered by halves.
+        // Of a capsule that runs from in front of another one to behind it, half is hidden.
         let slanted = solid([-1.0, -1.0, 2.0], [1.0, 1.0, 2.0], 0.1, Paint::Changed);
         let post = solid([-0.5, 0.0, 2.0], [0.5, 0.0, 2.0], 0.1, Paint::Torso);
         let both = draw(&camera(), &[slanted, post], FLOOR, SIZE);

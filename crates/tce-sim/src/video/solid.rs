@@ -1,4 +1,4 @@
-//! The robot as what can be drawn: capsules with a paint each.
+//! The robot as shapes to draw: capsules with one paint each.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use crate::SimError;
 use crate::models::robot::Vec3;
 use crate::models::{compiled, difference};
 
-/// What a part is, and so which colour it has.
+/// The kind of a part, which determines its colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Paint {
     /// The trunk.
@@ -31,7 +31,7 @@ pub(super) struct Solid {
     pub paint: Paint,
 }
 
-/// The parts of one robot, to be put into any pose.
+/// The parts of one robot, which can be put into any pose.
 pub(super) struct Body {
     data: MjData<Arc<MjModel>>,
     torso: usize,
@@ -44,7 +44,7 @@ struct Part {
     radius: f64,
     half_length: f64,
     paint: Paint,
-    /// Added to y. See [`aside`].
+    /// Offset in y. See [`aside`].
     aside: f64,
 }
 
@@ -67,7 +67,7 @@ impl Body {
         Ok(Self { data: MjData::new(model), torso, geoms })
     }
 
-    /// Where the torso and all parts are at these coordinates.
+    /// Positions of the torso and all parts at these coordinates.
     pub fn pose(&mut self, qpos: &[f64]) -> (Vec3, Vec<Solid>) {
         self.data.qpos_mut().copy_from_slice(qpos);
         self.data.kinematics();
@@ -75,7 +75,7 @@ impl Body {
         let solids = self.geoms.iter().map(|part| {
             let (mut centre, frame) = (centres[part.geom], frames[part.geom]);
             centre[1] += part.aside;
-            // A capsule lies along its z axis.
+            // The axis of a capsule is its z axis.
             let reach = if part.sphere { 0.0 } else { part.half_length };
             let end = |side: f64| std::array::from_fn(|i| centre[i] + side * reach * frame[3 * i + 2]);
             Solid { ends: [end(-1.0), end(1.0)], radius: part.radius, paint: part.paint }
@@ -84,7 +84,7 @@ impl Body {
     }
 }
 
-/// The paint of an unchanged part, by its geom's name (see `models/agents.rs`).
+/// The paint of an unchanged part, determined by the name of its geom (see `models/agents.rs`).
 fn paint(agent: Agent, name: &str) -> Paint {
     if name == "torso" || name == "head" {
         return Paint::Torso;
@@ -93,14 +93,14 @@ fn paint(agent: Agent, name: &str) -> Paint {
         Agent::Hopper => false,
         Agent::Walker2d => name.ends_with("_left"),
         Agent::HalfCheetah => name.starts_with('f'),
-        // Legs 1 and 2 lie at positive y.
+        // Legs 1 and 2 are at positive y.
         Agent::Ant => name.contains("_1_") || name.contains("_2_"),
     };
     if left { Paint::Left } else { Paint::Right }
 }
 
-/// How far to the side of its place a part is drawn. Walker2d's legs move in one plane, through each other: side by side they
-/// can be told apart. They are shown apart by less than a thigh's width, so that the foot still stands where it stands.
+/// Sideways offset at which a part is drawn. Walker2d's legs move through each other in one plane; side by side they
+/// can be distinguished. The offset is less than a thigh's width, so the feet stay near their true positions.
 fn aside(agent: Agent, paint: Paint) -> f64 {
     match (agent, paint) {
         (Agent::Walker2d, Paint::Right) => -0.06,
@@ -118,7 +118,7 @@ mod tests {
         Body::new(agent, shift).unwrap().pose(&qpos)
     }
 
-    /// Hopper at rest, from its description: the torso about 1.25 m, the thigh from 1.05 m to 0.6 m, the foot at 0.1 m.
+    /// Hopper at rest, from its description: torso at about 1.25 m, thigh from 1.05 m to 0.6 m, foot at 0.1 m.
     #[test]
     fn parts_are_where_the_model_says() {
         let (torso, solids) = rest(Agent::Hopper, Shift::Source);
@@ -134,7 +134,7 @@ mod tests {
         assert_eq!((ant.len(), ant[0].ends[0], ant[0].radius), (13, ant[0].ends[1], 0.25));
     }
 
-    /// The accent is for parts that differ, and for all of them, in every shift.
+    /// In every shift, all changed parts have the accent colour, and no other part has it.
     #[test]
     fn the_accent_marks_what_differs_and_nothing_else() {
         for agent in Agent::ALL {

@@ -1,10 +1,10 @@
-//! Letters on a picture.
+//! Draws text on a picture.
 
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 
 use super::picture::{Colour, Picture};
 
-/// How a line of text looks.
+/// The style of a line of text.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
     weight: FontWeight,
@@ -13,29 +13,29 @@ pub(super) struct Style {
 }
 
 impl Style {
-    /// Letters that suit a picture of `rows` pixels.
+    /// A style with a letter size that suits a picture of `rows` pixels.
     pub fn new(rows: usize, bold: bool, colour: Colour) -> Self {
         let weight = if bold { FontWeight::Bold } else { FontWeight::Regular };
         let size = if rows < 600 { RasterHeight::Size16 } else { RasterHeight::Size24 };
         Self { weight, size, colour }
     }
 
-    /// Pixels from one line to the next.
+    /// Distance between two lines, in pixels.
     pub fn line(&self) -> usize {
         self.size.val() + 2
     }
 
-    /// Pixels from one letter to the next.
+    /// Distance between two letters, in pixels.
     pub fn advance(&self) -> usize {
         get_raster_width(self.weight, self.size)
     }
 }
 
-/// Writes `text` with its top left corner at (`x`, `y`). What does not fit is cut off.
+/// Writes `text` with its top left corner at (`x`, `y`). Text that does not fit is cut off.
 pub(super) fn write(picture: &mut Picture, x: usize, y: usize, text: &str, style: Style) {
     for (k, letter) in text.chars().enumerate() {
         let left = x + k * style.advance();
-        // The font has all letters that labels are made of.
+        // The font has all letters that occur in labels.
         let Some(raster) = get_raster(letter, style.weight, style.size) else { continue };
         for (row, pixels) in raster.rows().enumerate() {
             for (column, &ink) in pixels.iter().enumerate() {
@@ -61,7 +61,7 @@ mod tests {
         assert!(dark.len() > 20);
         let right = 5 + 2 * style.advance();
         assert!(dark.iter().all(|&(x, y)| (5..right).contains(&x) && (4..20).contains(&y)), "{dark:?}");
-        // Beyond the edge: cut off, no panic.
+        // Text beyond the edge is cut off without a panic.
         write(&mut picture, 55, 25, "edge", style);
     }
 }

@@ -1,4 +1,4 @@
-//! Environments against closed forms and their own rules.
+//! Tests of environments against closed forms and their own rules.
 
 use proptest::prelude::*;
 use tce_base::Streams;
@@ -14,7 +14,7 @@ fn start(agent: Agent, shift: Shift, seed: u64) -> (Env, Vec<f32>) {
 
 #[test]
 fn a_hopper_in_the_air_falls_freely() {
-    // At rest and far above the floor, every part falls alike: v = -g dt, whatever the joints do.
+    // At rest and far above the floor, all parts fall equally: v = -g dt, whatever the joints do.
     for (shift, gravity) in [(Shift::Source, 9.81), (Shift::Gravity, 4.905), (Shift::Gravity5, 49.05)] {
         let mut env = Env::new(Agent::Hopper, shift).unwrap();
         let mut obs = [0.0; 11];
@@ -43,7 +43,7 @@ fn actions_cost_as_specified_and_are_clamped() {
             let result = env.step(&vec![level; agent.dims().1], &mut next);
             (result.reward, next)
         };
-        // Beyond the motors' range only the cost grows.
+        // Beyond the motors' range only the control cost increases.
         let ((r1, s1), (r2, s2)) = (outcome(1.0), outcome(2.0));
         assert_eq!(s1, s2, "{agent}: actions are clamped");
         assert!((r1 - r2 - 3.0 * cost * agent.dims().1 as f64).abs() < 1e-9, "{agent}: cost of actions");
@@ -54,7 +54,7 @@ fn actions_cost_as_specified_and_are_clamped() {
 
 #[test]
 fn the_reward_is_the_distance_covered() {
-    // Hopper, Walker2d, HalfCheetah: the coordinate itself.
+    // Hopper, Walker2d, HalfCheetah: the reward uses the coordinate itself.
     for agent in [Agent::HalfCheetah, Agent::Hopper, Agent::Walker2d] {
         let (mut env, mut obs) = start(agent, Shift::Source, 2);
         for _ in 0..5 {
@@ -65,8 +65,8 @@ fn the_reward_is_the_distance_covered() {
             assert!((result.reward - expected).abs() < 1e-9, "{agent}");
         }
     }
-    // Ant: the sum telescopes to the position that the last RK4 stage saw. The stage evaluates the end of the physics
-    // step from an estimate, so that it is close to the coordinate, but not equal to it.
+    // Ant: the sum telescopes to the position at the last RK4 stage. This stage evaluates the end of the physics step
+    // from an estimate, so the position is close to the coordinate, but not equal to it.
     let (mut env, mut obs) = start(Agent::Ant, Shift::Source, 2);
     let x = env.qpos()[0];
     let (mut sum, mut largest) = (0.0, 0.0_f64);
@@ -192,12 +192,12 @@ fn simulate_refuses_what_it_cannot_simulate() {
 
 #[test]
 fn a_step_that_blows_up_is_reported() {
-    // No robot moves at 1e11 m/s: MuJoCo resets itself beyond 1e10.
+    // No robot moves at 1e11 m/s: MuJoCo resets itself above 1e10.
     let mut states = vec![0.0; 17];
     states[8] = 1e11;
     let out = simulate(Agent::HalfCheetah, Shift::Source, &states, &[0.0; 6]).unwrap();
     assert!(out.rewards[0].is_nan() && out.terminals[0] && out.next_observations.iter().all(|x| x.is_nan()));
-    // A healthy row after it is not harmed.
+    // A healthy row after it is not affected.
     let (_, healthy) = start(Agent::HalfCheetah, Shift::Source, 0);
     let alone = simulate(Agent::HalfCheetah, Shift::Source, &healthy, &[0.0; 6]).unwrap();
     states.extend(&healthy);
@@ -208,7 +208,7 @@ fn a_step_that_blows_up_is_reported() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
-    /// The rule on observations is the environment's rule, wherever velocities are not clipped.
+    /// The rule on observations equals the environment's rule, wherever velocities are not clipped.
     #[test]
     fn the_rule_on_observations_is_the_environments(seed in 0u64..1000, height in 0.1f32..2.5, angle in -1.5f32..1.5) {
         for agent in Agent::ALL {

@@ -1,4 +1,4 @@
-//! The generated models: what MuJoCo makes of them, and that it agrees with the reference models.
+//! Tests of the generated models: MuJoCo's numbers for them, and their agreement with the reference models.
 
 use std::path::PathBuf;
 
@@ -33,7 +33,7 @@ fn half_cheetah_weighs_fourteen_kilograms_in_every_domain() {
 
 #[test]
 fn hoppers_mass_is_that_of_four_cylinders() {
-    // By hand: 1000 pi (r^2 h) with h = L + r: torso .05/.45, thigh .05/.5, leg .04/.54, foot .06/.45.
+    // Computed by hand: 1000 pi (r^2 h) with h = L + r: torso .05/.45, thigh .05/.5, leg .04/.54, foot .06/.45.
     let expected = 1000.0 * std::f64::consts::PI * (0.0025 * 0.45 + 0.0025 * 0.5 + 0.0016 * 0.54 + 0.0036 * 0.45);
     let mass = compiled(Agent::Hopper, Shift::Source).unwrap().totalmass();
     assert!((mass - expected).abs() < 1e-9, "{mass} kg instead of {expected} kg");
@@ -41,7 +41,7 @@ fn hoppers_mass_is_that_of_four_cylinders() {
 
 #[test]
 fn contacts_begin_at_the_distance_of_old() {
-    // This MuJoCo adds the margins of the two geoms; the environments were written for the larger of them.
+    // This MuJoCo version adds the margins of the two geoms; the environments were written for the larger of the two.
     for (agent, distance) in
         [(Agent::HalfCheetah, 0.0), (Agent::Hopper, 0.001), (Agent::Walker2d, 0.0), (Agent::Ant, 0.01)]
     {
@@ -106,7 +106,7 @@ fn models_agree_with_the_reference_models() {
         close!(jnt_range, jnt_axis, jnt_pos, jnt_solref, jnt_solimp, dof_armature);
         close!(geom_pos, geom_friction, geom_margin, geom_gap, geom_solref, geom_solimp);
         close!(actuator_gear, actuator_ctrlrange, actuator_gainprm, actuator_biasprm);
-        // The floor's size is for show.
+        // The floor's size only affects its appearance.
         compare(
             &format!("{name}: geom_size"),
             ours.geom_size()[1..].iter().flatten(),

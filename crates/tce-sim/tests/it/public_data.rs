@@ -1,4 +1,4 @@
-//! The public data sets, replayed.
+//! Replays the public data sets.
 
 use std::path::PathBuf;
 

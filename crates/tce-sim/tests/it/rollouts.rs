@@ -1,4 +1,4 @@
-//! Rollouts: whole, in order, and the same at any number of threads.
+//! Tests of rollouts: complete, in order, and the same at any number of threads.
 
 use std::sync::Mutex;
 
@@ -35,7 +35,7 @@ fn the_same_bytes_at_any_number_of_threads() {
 #[test]
 fn lanes_are_filled_in_order_and_cut_with_a_time_out() {
     let data = random(Agent::HalfCheetah, 4003, 3, 1);
-    // HalfCheetah never falls: 1335 + 1334 + 1334 rows, each a whole episode and a cut one.
+    // HalfCheetah never falls: 1335 + 1334 + 1334 rows, each one whole episode and one cut episode.
     let ends: Vec<usize> = data.episodes().iter().map(|e| e.end).collect();
     assert_eq!(ends, [1000, 1335, 2335, 2669, 3669, 4003]);
     assert!(data.terminals.iter().all(|&t| !t));
@@ -60,7 +60,7 @@ fn rows_of_an_episode_follow_each_other() {
 
 #[test]
 fn a_lane_does_not_depend_on_the_others() {
-    // A lane's rows are those that the environment gives with this lane's streams.
+    // The rows of a lane equal those of a single environment with the streams of this lane.
     let data = random(Agent::Walker2d, 90, 3, 5);
     let streams = Streams::new(5);
     let mut env = Env::new(Agent::Walker2d, Shift::Morph).unwrap();
@@ -97,7 +97,7 @@ fn evaluation_steps_only_what_still_runs() {
     assert_eq!(sizes.iter().sum::<usize>(), results.iter().map(|r| r.length).sum::<usize>());
     assert!(sizes.is_sorted_by(|a, b| a >= b) && sizes[0] == 6);
 
-    // Episode 2 on its own.
+    // Episode 2 alone.
     let mut env = Env::new(Agent::Hopper, Shift::Source).unwrap();
     let mut obs = vec![0.0; 11];
     env.reset(&mut Streams::new(0).indexed("evaluate/reset", 2), &mut obs);
@@ -154,14 +154,14 @@ fn replay_refuses_another_robots_rows() {
     assert!(matches!(error, SimError::Dimension { found: 11, expected: 111, .. }), "{error}");
 }
 
-/// Acts by how many steps its episode has had, and checks that it was told every reward.
+/// Chooses actions by the number of steps in the episode, and records the rewards passed to it.
 struct Counting {
-    /// Sum of the rewards before the last step, of every episode that was evaluated, and its steps.
+    /// For every evaluated episode: its number of steps, and the sum of its rewards before the last step.
     told: Mutex<Vec<(usize, f64)>>,
 }
 
 impl Actor for Counting {
-    /// The number of the lane's episode in `told`, if it acted already.
+    /// The index of the lane's episode in `told`, once it has acted.
     type Memory = Option<usize>;
 
     fn start(&self) -> Option<usize> {
@@ -206,7 +206,7 @@ fn a_memory_lives_as_long_as_its_episode() {
 
     let actor = Counting { told: Mutex::default() };
     let results = evaluate(Agent::Hopper, Shift::Source, &actor, 5, Streams::new(0), || false).unwrap();
-    // Episodes begin in their order; a lane that leaves takes its memory along.
+    // Episodes begin in order; when a lane stops, its memory is removed with it.
     for (result, (steps, told)) in results.iter().zip(actor.told.lock().unwrap().iter()) {
         assert_eq!(result.length, *steps);
         assert!(*told != 0.0 && (result.episode_return - told).abs() < 20.0, "all rewards but the last");

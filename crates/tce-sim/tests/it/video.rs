@@ -1,4 +1,4 @@
-//! Videos: the episode that was evaluated, the same pixels always, and what a viewer must be able to tell.
+//! Tests of videos: the evaluated episode, the same pixels every time, and details that a viewer must distinguish.
 
 use rayon::prelude::*;
 use tce_base::Streams;
@@ -16,13 +16,13 @@ fn video(recordings: Vec<Recording>) -> Video {
     Video::new(recordings, VideoOptions { size: SIZE, ..VideoOptions::default() }).unwrap()
 }
 
-/// The columns of one panel.
+/// The pixels of one panel.
 fn panel(picture: &Picture, number: usize) -> Vec<Colour> {
     let start = number * (SIZE[0] + 2);
     picture.pixels.chunks_exact(picture.width).flat_map(|row| row[start..start + SIZE[0]].to_vec()).collect()
 }
 
-/// Pixels in the accent's hue: vermilion, whatever the light on it.
+/// Number of pixels in the hue of the accent colour (vermilion), at any brightness.
 fn accents(pixels: &[Colour]) -> usize {
     let orange = |p: &&Colour| {
         let [r, g, b] = p.map(f64::from);
@@ -52,17 +52,17 @@ fn time_runs_as_it_does_in_the_simulator() {
     let hopper = record(Agent::Hopper, Shift::Source, 1);
     let length = hopper.length();
     assert!(length < 200, "random hopping ends soon");
-    // 8 ms a step: every fifth step makes 25 pictures a second; 25 more for the last second.
+    // 8 ms per step: every fifth step gives 25 pictures per second; 25 more for the last second.
     let real = video(vec![hopper.clone()]);
     assert_eq!((real.stride(), real.frames(), real.size()), (5, length.div_ceil(5) + 1 + 25, SIZE));
     assert!((real.interval() - 0.04).abs() < 1e-12);
     assert_eq!(real.steps(), length);
     let with = |seconds, speed| Video::new(vec![hopper.clone()], VideoOptions { size: SIZE, seconds, speed }).unwrap();
-    // A fifth of the speed: every step; five pictures is all there is room for.
+    // A fifth of the speed: every step is shown, and there is time for only five pictures.
     let slow = with(0.2, 0.2);
     assert_eq!((slow.stride(), slow.frames(), slow.steps()), (1, 5, 4));
     assert_eq!(with(10.0, 4.0).stride(), 20);
-    // HalfCheetah and Ant have 50 ms a step: every step a picture.
+    // HalfCheetah and Ant have 50 ms per step: every step is a picture.
     let ant = video(vec![record(Agent::Ant, Shift::Source, 1)]);
     assert_eq!((ant.stride(), ant.frames().min(200)), (1, ant.frames()));
     assert!((ant.interval() - 0.05).abs() < 1e-12);
@@ -81,7 +81,7 @@ fn the_same_pixels_in_any_order_at_any_number_of_threads() {
 
 #[test]
 fn an_episode_that_is_over_stays_on_its_last_picture() {
-    // The shortest and the longest of a few.
+    // The shortest and the longest of a few episodes.
     let mut some: Vec<Recording> = (0..12).map(|seed| record(Agent::Hopper, Shift::Source, seed)).collect();
     some.sort_by_key(Recording::length);
     let (short, long) = (some.swap_remove(0), some.pop().unwrap());
@@ -105,7 +105,7 @@ fn the_accent_is_seen_in_the_changed_robot_only() {
         let first = video(vec![record(agent, Shift::Source, 4), record(agent, shift, 4)]).draw(0);
         assert_eq!(accents(&panel(&first, 0)), 0, "{agent}");
         let changed = panel(&first, 1);
-        // The legend lies in the lowest rows; another gravity is only told there.
+        // The legend is in the lowest rows; another gravity is shown only there.
         let above = accents(&changed[..150 * SIZE[0]]);
         assert!(accents(&changed[150 * SIZE[0]..]) > 40, "{agent}-{shift}: a legend");
         assert_eq!(above > 30, body, "{agent}-{shift}: {above} pixels");
