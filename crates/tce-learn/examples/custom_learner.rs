@@ -1,10 +1,10 @@
-//! A learner of one's own: cloning of the better half of every batch, by reward.
+//! A custom learner: it clones the better half of every batch, by reward.
 //!
 //!     cargo run --release --example custom_learner
 //!
-//! A learner is `Learner` (one update, its state for checkpoints) and `PolicyLearner` (its policies). The training loop, minibatches,
-//! checkpoints, several seeds at once and policy files come with them. For `--learner`, presets and reports a learner also needs a
-//! configuration and a line in the registry: docs/extend.md.
+//! A learner implements `Learner` (one update, its state for checkpoints) and `PolicyLearner` (its policies). It then
+//! has the training loop, minibatches, checkpoints, several seeds at once and policy files. For `--learner`, presets
+//! and reports, it also needs a configuration and a line in the registry: docs/extend.md.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use tce_learn::{
 };
 use tce_nn::{Checkpoints, NamedParameters, NetworkError, cpu, host};
 
-/// Cloning of the half of every batch that was rewarded most.
+/// Clones the half of every batch with the highest rewards.
 struct RewardedHalf(Bc);
 
 impl Learner for RewardedHalf {
@@ -53,7 +53,7 @@ impl PolicyLearner for RewardedHalf {
     }
 }
 
-/// Two behaviours in one log: a = s / 2 is rewarded, a = -s / 2 is not.
+/// One log with two behaviours: a = s / 2 is rewarded, a = -s / 2 is not.
 fn log() -> Transitions {
     let mut rng = Streams::new(3).stream("log");
     let mut log = Transitions::new(1, 1);

@@ -1,8 +1,8 @@
-//! IQL on arrays of one's own: a point on a line that should be at 0, logged while it wandered about.
+//! IQL on the user's own arrays: a point on a line that should be at 0, logged during a random walk.
 //!
 //!     cargo run --release --example iql_on_arrays
 //!
-//! Two seeds are trained as one population. The learned actions pull the point to 0, which the log itself never did.
+//! Two seeds are trained as one population. The learned actions move the point to 0; the logged ones never did.
 
 use std::sync::Arc;
 
@@ -40,7 +40,7 @@ fn main() -> Result<(), LearnError> {
         row_scores: None,
     };
     let buffer = Buffer::new(vec![member(0), member(1)], 128)?;
-    // Greedier than the usual settings: the log is of an aimless policy.
+    // Greedier than the usual settings, because the log is from an aimless policy.
     let config = IqlConfig { expectile: 0.9, temperature: 10.0, hidden: vec![64, 64], ..IqlConfig::paper() };
     let steps = Steps::new(3000, 1000);
     let mut iql = Iql::new(&buffer, &config, Regulariser::None, steps.to, &cpu())?;

@@ -1,4 +1,4 @@
-//! Held-out errors of the label models on a target file, per variant of the input and the schedule:
+//! Held-out errors of the label models on a target file, for each variant of the input and the learning rate schedule:
 //! `cargo run --release -p tce-learn --example label_errors TARGET.hdf5 [STEPS]`.
 
 use std::path::Path;

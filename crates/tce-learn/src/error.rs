@@ -1,41 +1,41 @@
-//! What can go wrong before a training starts, or with a file of a policy.
+//! Errors before training starts, and errors of policy files.
 
 use std::path::PathBuf;
 
 use tce_base::FileError;
 use tce_nn::NetworkError;
 
-/// A learner refused its input.
+/// A learner rejected its input.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnError {
-    /// A field of a configuration, or of the data a learner is given, cannot be used.
+    /// A field of a configuration, or of the learner's data, cannot be used.
     #[error("{field}: found {found}, expected {expected}; {remedy}")]
     Invalid {
         /// The field.
         field: String,
         /// Its value.
         found: String,
-        /// What would be accepted.
+        /// What is accepted.
         expected: String,
         /// What to do.
         remedy: String,
     },
-    /// A file of parameters.
+    /// An error of a parameter file.
     #[error(transparent)]
     Network(#[from] NetworkError),
-    /// A file.
+    /// An error of a file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A file is not a policy, or not one of a kind known here.
+    /// A file is not a policy, or is a policy of an unknown kind.
     #[error("{}: {field}: found {found}, expected {expected}; {remedy}", path.display())]
     Policy {
         /// The file.
         path: PathBuf,
-        /// The array or key.
+        /// The array or metadata key.
         field: String,
-        /// What the file holds.
+        /// What the file contains.
         found: String,
-        /// What would be accepted.
+        /// What is accepted.
         expected: String,
         /// What to do.
         remedy: String,
@@ -43,7 +43,7 @@ pub enum LearnError {
 }
 
 impl LearnError {
-    /// A value that cannot be used: its field, what was found, what is expected, and what to do.
+    /// The error for a value that cannot be used: its field, what was found, what is expected, and what to do.
     pub fn invalid(
         field: impl Into<String>,
         found: impl ToString,
@@ -59,7 +59,7 @@ impl LearnError {
     }
 }
 
-/// Refuses a value outside `range` (NaN is outside of every range).
+/// Returns an error for a value outside `range` (NaN is outside of every range).
 pub(crate) fn within(field: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<(), LearnError> {
     if range.contains(&value) {
         return Ok(());

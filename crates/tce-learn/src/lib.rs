@@ -1,23 +1,24 @@
-//! Learning from transitions, P members at once: seeds, data sets and variants are the leading axis of every tensor.
+//! Learning from transitions, P members at once: seeds, data sets and variants are every tensor's first axis.
 //!
 //! | piece | file |
 //! |---|---|
 //! | rows and minibatches | [`Buffer`], [`Member`] |
 //! | the one training loop | [`train`], [`Learner`] |
-//! | trained policies, ours and others' | [`Policy`], [`import`] |
+//! | trained policies of this and of other programs | [`Policy`], [`import`] |
 //! | weighted imitation of actions | [`actor`], [`losses`] |
 //! | behaviour cloning | [`bc`] |
 //! | implicit Q-learning | [`iql`] |
 //! | deterministic actor-critics | [`td3_bc`], [`rebrac`], [`deterministic`] |
-//! | prior methods, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`]; as coded or as meant: [`Mode`]; what they share: [`on_iql`] |
-//! | choosing among a batch's rows | [`selection`] |
-//! | DmC: scored rows, filtered and weighed | [`dmc`] |
+//! | prior methods, which train on source and target rows | [`dara`], [`bosa`], [`srpo`], [`igdf`], [`otdf`] |
+//! | the published or corrected form of a method, and shared code | [`Mode`], [`on_iql`] |
+//! | selection of rows in a batch | [`selection`] |
+//! | DmC: rows filtered and weighted by scores | [`dmc`] |
 //! | a transformer on contexts of a world model | [`meta_dt`], [`transformer`], [`world_model`], [`sequences`] |
-//! | the behaviour model and what it is for | [`cvae`], [`regulariser`] |
+//! | the behaviour model and its use | [`cvae`], [`regulariser`] |
 //! | actions, rewards and terminals of generated pairs | [`labels`], [`pair_model`] |
-//! | one-step predictions in both domains, to filter rows and to try policies by | [`dynamics`] |
-//! | what a policy is worth by the rows alone | [`mod@fitted_q`] |
-//! | densities of a domain's transitions, to compare domains by | [`transition_model`] |
+//! | one-step predictions in both domains, to filter rows and to test policies | [`dynamics`] |
+//! | the value of a policy, estimated from the rows alone | [`mod@fitted_q`] |
+//! | densities of a domain's transitions, to compare domains | [`transition_model`] |
 
 pub mod algorithms;
 pub mod core;
@@ -25,7 +26,7 @@ mod error;
 pub mod models;
 pub mod policies;
 
-// Modules go by their own names: where they lie is for those who look for them.
+// Modules are re-exported under their own names; their folder only matters to readers of the source.
 use crate::algorithms::iql_config;
 pub use crate::algorithms::{
     bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac, selection,

@@ -12,20 +12,22 @@
 //! | - | `mixed_steps` | 0 | own: generated rows are fitted sooner than they are right, see below |
 //! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
 //!
-//! Behaviour policies are sampled, and a network that fits 5000 noisy actions to the last digit fits their noise: on HalfCheetah two
-//! layers come to an error of .04 at their rows and .20 at those of an episode that they have not seen. Dropout lowers the second error,
-//! but the policies score less; a third layer lowers it, and they score more (bench/expansion.md).
+//! Behaviour policies are sampled. A network that fits 5000 noisy actions exactly therefore fits their noise: on
+//! HalfCheetah, two layers have an error of .04 on their own rows and .20 on an unseen episode. Dropout lowers the
+//! second error, but the policies score lower; a third layer lowers it, and the policies score higher
+//! (bench/expansion.md).
 //!
-//! Clones of one data set differ by where their weights began, and so does whether they fall. The mean of several makes fewer of
-//! the errors that they do not share: Walker2d, four clones of the same rows, 48 to 88 points each, 93.5 together (bench/expansion.md).
-//! An ensemble sees the same batches and becomes one wider network ([`crate::MlpPolicy::average`]).
+//! Clones of one data set differ in their initial weights, and this decides whether they fall. The mean of several
+//! clones makes fewer of the errors that they do not share: Walker2d, four clones of the same rows, 48 to 88 points
+//! each, 93.5 together (bench/expansion.md). An ensemble sees the same batches and becomes one wider network
+//! ([`crate::MlpPolicy::average`]).
 //!
-//! Clones of target and generated rows get worse again when they are trained longer than clones of the target rows alone: HalfCheetah,
-//! ensembles of five, 73, 77, 68 points after 8k, 15k, 30k steps; Walker2d 70, 93, 92 (bench/expansion.md). The caller asks
-//! [`BcConfig::steps`] how long to train.
+//! Clones of target and generated rows need shorter training than clones of the target rows alone and then get worse
+//! again: HalfCheetah, ensembles of five, 73, 77, 68 points after 8k, 15k, 30k steps; Walker2d 70, 93, 92
+//! (bench/expansion.md). The caller gets the number of steps from [`BcConfig::steps`].
 //!
-//! Raw or standardised observations, and all rows or the best trajectories, are properties of a member's data: one
-//! population may hold all of them.
+//! Raw or standardised observations, and all rows or the best trajectories, are properties of a member's data. One
+//! population may contain all of them.
 
 use std::path::Path;
 
@@ -124,12 +126,12 @@ impl Default for BcConfig {
     }
 }
 
-// Nor do those of runs that were done before there was this key.
+// The cache keys of runs from before this key was added do not contain it.
 fn is_zero(batch: &usize) -> bool {
     *batch == 0
 }
 
-// The keys of runs that were done before there was dropout do not name it.
+// The cache keys of runs from before dropout was added do not contain it.
 fn no_dropout(rate: &f64) -> bool {
     *rate == 0.0
 }
@@ -149,7 +151,7 @@ pub enum CloneLoss {
 }
 
 impl CloneLoss {
-    // The keys of runs that were done before there was a choice do not name it.
+    // The cache keys of runs from before this key was added do not contain it.
     fn is_squared(&self) -> bool {
         *self == Self::Squared
     }
@@ -157,7 +159,7 @@ impl CloneLoss {
 
 /// Behaviour cloning of a population.
 pub struct Bc {
-    /// One population for each policy of the ensembles.
+    /// One population for each position in the ensembles.
     actors: Vec<Actor>,
     members: Vec<Streams>,
     dropout: f64,
@@ -185,7 +187,7 @@ impl Bc {
     }
 }
 
-/// A step of one population. Returns its loss.
+/// One step of one population. Returns its loss.
 fn step(actor: &mut Actor, batch: &Minibatch, mut dropout: Vec<Dropout>, step: u64, loss: CloneLoss) -> Tensor<3> {
     let output = actor.forward_with(batch.s.clone(), |h| Dropout::apply_members(&mut dropout, h));
     let loss = match loss {
@@ -198,7 +200,7 @@ fn step(actor: &mut Actor, batch: &Minibatch, mut dropout: Vec<Dropout>, step: u
     value
 }
 
-/// What the names of policy `k` of an ensemble begin with in a checkpoint.
+/// The prefix of the names of policy `k` of an ensemble in a checkpoint.
 fn prefix(k: usize) -> String {
     if k == 0 { String::new() } else { format!("{k}/") }
 }
@@ -207,7 +209,7 @@ impl Learner for Bc {
     fn update(&mut self, batch: &Minibatch, at: u64, meter: &mut Meter) {
         let masks = |k: usize| -> Vec<Dropout> {
             if self.dropout == 0.0 {
-                // A generator for each update and policy is not free.
+                // Creating a generator for each update and policy costs time.
                 return Vec::new();
             }
             let name = format!("dropout {k}");
@@ -221,7 +223,7 @@ impl Learner for Bc {
     fn state(&self) -> NamedParameters {
         let mut state = NamedParameters::default();
         for (k, actor) in self.actors.iter().enumerate() {
-            // The first one's names are those of a policy alone.
+            // The first policy has the same names as a single policy.
             let mut own = NamedParameters::default();
             actor.save(&mut own);
             state.extend_under(&prefix(k), own);

@@ -1,4 +1,5 @@
-//! BOSA (Liu et al. 2024): critics learn from rows that the dynamics of both domains support, the policy stays where behaviour does.
+//! BOSA (Liu et al. 2024): critics learn from rows that both domains' dynamics support; the policy stays near the
+//! behaviour.
 //!
 //! ```text
 //! β̂(a|s), p̂_1..n(s'|s, a): variational autoencoders on rows of both domains ([`crate::cvae`]), before the first step
@@ -20,11 +21,12 @@
 //! | - | `critic_lr`, `hidden`, `actor` | 3e-4, 256-256 | ODRL |
 //! | - | `mode` | corrected | published: y = r + γ terminal min(Q1', Q2')(s', a') |
 //!
-//! s' is standardised here, without the dimensions that never change, where ODRL models it raw and whole. ln ε is then another bar: with β² = .125
-//! every dimension that is modelled perfectly adds .12 to ln p̂. In our runs the mask keeps 95 % of the rows (Ant) or more.
+//! Here s' is standardised and without the dimensions that never change; ODRL models it raw and complete. The same ln ε
+//! is therefore another threshold: with β² = .125 every perfectly modelled dimension adds .12 to ln p̂. In our runs the
+//! mask keeps 95 % of the rows (Ant) or more.
 //!
-//! **Published**: ODRL's buffer returns 1 - terminal, which its BOSA takes for terminal: it bootstraps at terminal rows and nowhere
-//! else, and the critics learn the immediate reward.
+//! **Published**: ODRL's buffer returns 1 - terminal, but its BOSA uses this value as terminal. It therefore bootstraps
+//! at terminal rows only, and the critics learn the immediate reward.
 
 use std::path::Path;
 
@@ -153,7 +155,7 @@ impl BosaConfig {
     }
 }
 
-/// β̂ and p̂_1..n while they are trained, side by side on the same batches.
+/// β̂ and p̂_1..n during their training, in parallel on the same batches.
 struct Autoencoders {
     all: Vec<CvaeLearner>,
 }
@@ -188,7 +190,7 @@ impl Learner for Autoencoders {
 /// BOSA of a population.
 pub type Bosa = Deterministic<Support>;
 
-/// β̂ and p̂_1..n, and what they are asked for.
+/// β̂ and p̂_1..n, and the settings for their use.
 pub struct Support {
     config: BosaConfig,
     behaviour: Cvae,
@@ -197,8 +199,8 @@ pub struct Support {
 }
 
 impl Bosa {
-    /// New networks for the members of `buffer`, to be trained for `steps` steps; the autoencoders are trained here. None if the
-    /// user interrupted that.
+    /// New networks for the members of `buffer`, to be trained for `steps` steps. The autoencoders are trained here.
+    /// `None` if the user interrupted their training.
     ///
     /// # Errors
     /// If the configuration cannot be used, or there are no source rows.
@@ -248,7 +250,7 @@ impl Support {
     }
 }
 
-/// y, from q = min(Q1', Q2')(s', a').
+/// y, computed from q = min(Q1', Q2')(s', a').
 pub fn critic_target(batch: &Minibatch, q: Tensor<3>, discount: f64, mode: Mode) -> Tensor<3> {
     let bootstrap = match mode {
         Mode::Corrected => batch.not_done.clone(),

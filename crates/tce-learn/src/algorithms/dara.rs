@@ -1,4 +1,4 @@
-//! DARA (Liu et al. 2022): source rewards are lowered where the source moves in a way that the target does not.
+//! DARA (Liu et al. 2022): lowers source rewards where a source transition is unlikely in the target.
 //!
 //! ```text
 //! C_sas, C_sa: classifiers of (s, a, s') and (s, a) into source and target, on inputs x + σ n, n ~ N(0, I)
@@ -16,9 +16,10 @@
 //! | - | `lr` | 3e-4 | ODRL |
 //! | - | `mode` | corrected | published: p is a softmax of a softmax (below) |
 //!
-//! **Published**: ODRL's forward pass ends in a softmax, and both of its users take the result for logits. L_C is then between .31 and
-//! 1.31 for every row, with a gradient that vanishes where the classifier is sure; the log-odds of which Δ is the difference are a
-//! difference of probabilities, |Δ| ≤ 2: no source row loses more than 2 η, where the method means up to c η.
+//! **Published**: ODRL's forward pass ends in a softmax, and both callers use the result as logits. L_C is then between
+//! .31 and 1.31 for every row, and its gradient vanishes where the classifier is certain. Δ should be a difference of
+//! log-odds, but becomes a difference of probabilities with |Δ| ≤ 2: no source row loses more than 2 η, not up to c η
+//! as in the method.
 
 use std::path::Path;
 
@@ -116,7 +117,7 @@ pub struct Classifiers {
     config: DaraConfig,
     sas: Trained<Mlp>,
     sa: Trained<Mlp>,
-    /// They draw batches of their own.
+    /// The classifiers draw their own batches from it.
     buffer: Buffer,
 }
 
@@ -150,7 +151,7 @@ impl Dara {
     }
 }
 
-/// What a mode takes for the logits of a classifier with `outputs` `[P, B, 2]`. Published: their softmax.
+/// The logits of a classifier with `outputs` `[P, B, 2]` in a mode. Published: their softmax.
 fn logits(outputs: Tensor<3>, mode: Mode) -> Tensor<3> {
     match mode {
         Mode::Published => softmax(outputs, 2),
@@ -257,13 +258,13 @@ mod tests {
 
     #[test]
     fn the_gap_is_the_difference_of_log_odds() {
-        // With probabilities far from 0 the odds are the differences of the outputs.
+        // If no probability is near 0, the log-odds are the differences of the outputs.
         let sa = tensor(vec![0.2, 0.1, 0.0, 0.0, -1.0, 1.0], [1, 3, 2], &cpu());
         let gap = host(dynamics_gap(outputs(), sa.clone(), Mode::Corrected));
         for (gap, expected) in gap.iter().zip([3.0 + 0.1, -1.0, 1.0 - 2.0]) {
             assert!((gap - expected).abs() < 1e-5, "{gap} is not {expected}");
         }
-        // Of probabilities taken for outputs: p_tar − p_src of either classifier.
+        // Probabilities used as outputs: p_tar − p_src of either classifier.
         let gap = host(dynamics_gap(outputs(), sa, Mode::Published));
         let odds = |a: f64, b: f64| softmax2(a, b).1 - softmax2(a, b).0;
         let expected = [odds(-1.0, 2.0) - odds(0.2, 0.1), odds(0.5, -0.5), odds(3.0, 4.0) - odds(-1.0, 1.0)];

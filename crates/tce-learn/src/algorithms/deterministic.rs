@@ -1,4 +1,4 @@
-//! The deterministic policy of TD3 (Fujimoto et al. 2018), as TD3+BC, ReBRAC and BOSA train it.
+//! The deterministic policy of TD3 (Fujimoto et al. 2018), as trained by TD3+BC, ReBRAC and BOSA.
 //!
 //! ```text
 //! a' = clip(π'(s') + clip(σ n, ±c), ±1), n ~ N(0, I)
@@ -50,10 +50,10 @@ impl Default for DelayConfig {
 }
 
 impl DelayConfig {
-    /// Refuses numbers out of range.
+    /// Returns an error for numbers out of range.
     ///
     /// # Errors
-    /// Names the field.
+    /// The error names the field.
     pub fn check(&self) -> Result<(), LearnError> {
         within("delay.std", self.std, 0.0..=1e3)?;
         within("delay.clip", self.clip, 0.0..=1e3)?;
@@ -97,24 +97,24 @@ impl ActorCritic {
         })
     }
 
-    /// a' at s' `[P, B, inputs]`, no part of autodiff; the noise is that of `step`.
+    /// a' at s' `[P, B, inputs]`, outside of autodiff; the noise is that of `step`.
     pub fn next_action(&self, s2: Tensor<3>, step: u64) -> Tensor<3> {
         let a = self.actor.followed(&self.target, s2);
         let noise = member_noise(&self.members, "target noise", step, a.dims(), &a.device()) * self.config.std;
         (a + noise.clamp(-self.config.clip, self.config.clip)).clamp(-1.0, 1.0)
     }
 
-    /// min(Q1', Q2')(s', a'), no part of autodiff.
+    /// min(Q1', Q2')(s', a'), outside of autodiff.
     pub fn next_value(&self, s2: Tensor<3>, a2: Tensor<3>) -> Tensor<3> {
         self.critics.lesser_target(state_action(&s2, a2))
     }
 
-    /// Whether the policy is trained at `step`, counted from 0: the d-th, 2d-th, ...
+    /// Whether the policy is trained at `step`, counted from 0. It is trained at the d-th, 2d-th, ... step.
     pub fn due(&self, step: u64) -> bool {
         (step + 1).is_multiple_of(self.config.every)
     }
 
-    /// ρ where the policy is trained, else 0: target critics move with it.
+    /// ρ if the policy is trained at `step`, otherwise 0: target critics move only together with it.
     pub fn polyak(&self, step: u64) -> f64 {
         if self.due(step) { self.config.polyak } else { 0.0 }
     }
@@ -124,7 +124,7 @@ impl ActorCritic {
         self.actor.forward(s)
     }
 
-    /// A step of π down `loss`, and of π' after it.
+    /// One step of π on `loss`, followed by one step of π'.
     pub fn step(&mut self, loss: Tensor<3>, step: u64) {
         self.actor.step_averaged(loss, step, &mut self.target, self.config.polyak);
     }
@@ -148,7 +148,7 @@ pub trait UpdateRule: Send {
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter);
 }
 
-/// An [`ActorCritic`] under a [`UpdateRule`].
+/// An [`ActorCritic`] trained by an [`UpdateRule`].
 pub struct Deterministic<R> {
     pub(crate) nets: ActorCritic,
     pub(crate) rule: R,

@@ -1,5 +1,5 @@
-//! DmC's learner (ECAI 2025): IQL on target rows and on the better half of source and generated rows, each with a score of how
-//! target-like it is.
+//! DmC's learner (ECAI 2025): IQL on target rows and on the better half of source and generated rows. Each of these has
+//! a score that says how target-like it is.
 //!
 //! ```text
 //! batch  n target rows, n others (source ∪ generated rows), c(x) ∈ (0, 1] the score of an other row
@@ -17,7 +17,7 @@
 //! | weights of L_π | a column times a row of losses: every action is cloned with the mean weight | each row's own |
 //! | behaviour CVAE | β₀, as it was initialised: the published script trains it under a condition that is never met | β, trained on the target rows |
 //!
-//! Nothing else differs between the two.
+//! The modes do not differ in anything else.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -109,7 +109,7 @@ impl Default for DmcConfig {
 }
 
 impl DmcConfig {
-    /// `base` with what DmC takes over from OTDF: its policy and regulariser, and the policy extraction of the mode.
+    /// `base` with the parts that DmC takes from OTDF: policy and regulariser, and the mode's policy extraction.
     pub fn backbone(&self, base: &IqlConfig) -> IqlConfig {
         otdf_policy(base, self.mode, self.beta_reg)
     }
@@ -118,7 +118,7 @@ impl DmcConfig {
 /// DmC's learner of a population.
 pub type Dmc = OnIql<Scored>;
 
-/// The rows with the better scores.
+/// Keeps the rows with the highest scores.
 pub struct Scored {
     config: DmcConfig,
     members: Vec<Member>,
@@ -129,7 +129,7 @@ impl Dmc {
     /// [`DmcConfig::behaviour`].
     ///
     /// # Errors
-    /// If a configuration cannot be used, or there are no other rows or no scores of them.
+    /// If a configuration cannot be used, or there are no other rows or they have no scores.
     pub fn new(
         buffer: &Buffer,
         config: &DmcConfig,

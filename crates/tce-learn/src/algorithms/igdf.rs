@@ -1,4 +1,4 @@
-//! IGDF (Wen et al. 2024): source rows are kept by how well their successor fits the target's dynamics, told by contrast.
+//! IGDF (Wen et al. 2024): keeps source rows whose successor fits the target's dynamics (contrastive learning).
 //!
 //! ```text
 //! φ: (s, a) → R^k, ψ: s' → R^k;  x_ij = φ_i · ψ_j for a target row i, j its own successor or that of a source row
@@ -18,9 +18,9 @@
 //! | - | `batch` | 128 target rows, 127 source rows for all of them | ODRL |
 //! | - | `mode`, `code` | corrected | published, odrl: φ and ψ stay as they were drawn; published, authors: w is its mean |
 //!
-//! **Published**: there are two public codes. ODRL defines the training of φ and ψ and never calls it, so that random networks
-//! choose. IGDF's authors train them, and multiply weights `[N, 1]` by squared errors `[N]`: the mean of that N × N matrix is the
-//! mean weight times L_Q, and no row weighs more than another.
+//! **Published**: there are two public implementations. ODRL defines the training of φ and ψ but never calls it, so
+//! random networks select the rows. IGDF's authors train them, but multiply weights `[N, 1]` by squared errors `[N]`:
+//! the mean of that N × N matrix is the mean weight times L_Q, so all rows have the same weight.
 
 use std::path::Path;
 
@@ -130,7 +130,7 @@ impl Default for IgdfConfig {
 }
 
 impl IgdfConfig {
-    /// Whether the defect of `code` is trained with.
+    /// Whether training includes the defect of `code`.
     fn as_in(&self, code: Code) -> bool {
         self.mode == Mode::Published && self.code == code
     }
@@ -143,7 +143,7 @@ struct Pair {
     psi: Mlp,
 }
 
-/// φ and ψ of a population, as they are trained.
+/// φ and ψ of a population, with their training.
 pub struct Encoders {
     config: IgdfConfig,
     pair: Trained<Pair>,
@@ -160,7 +160,7 @@ impl Encoders {
         Self { pair: Trained::new(pair), config: config.clone() }
     }
 
-    /// cos(φ(s, a), ψ(s')) of the rows that are not target rows, members one after the other.
+    /// cos(φ(s, a), ψ(s')) of the rows that are not target rows, sorted by member.
     fn scores(&self, batch: &Minibatch) -> Vec<f32> {
         let sa = state_action(&batch.s, batch.a.clone());
         let pair = self.pair.net().valid();
@@ -168,7 +168,7 @@ impl Encoders {
     }
 }
 
-/// Cosine of the angle between the rows of x and y `[P, B, k]`, `[P, B, 1]`; 0 where one of them vanishes.
+/// Cosine of the angle between the rows of x and y `[P, B, k]`, `[P, B, 1]`; 0 where one of them is zero.
 pub fn cosine(x: Tensor<3>, y: Tensor<3>) -> Tensor<3> {
     let norm = |v: &Tensor<3>| v.clone().square().sum_dim(2).sqrt();
     let norms = (norm(&x) * norm(&y)).clamp_min(1e-8);
@@ -211,8 +211,8 @@ impl Learner for Encoders {
 pub type Igdf = OnIql<Encoders>;
 
 impl Igdf {
-    /// New networks for the members of `buffer`, to be trained for `steps` steps; φ and ψ are trained here. None if the user
-    /// interrupted that.
+    /// New networks for the members of `buffer`, to be trained for `steps` steps. φ and ψ are trained here. `None` if
+    /// the user interrupted their training.
     ///
     /// # Errors
     /// If a configuration cannot be used, or there are no source rows.
@@ -229,7 +229,7 @@ impl Igdf {
         need_others("IGDF", buffer.members())?;
         let mut encoders = Encoders::new(buffer, config, device);
         if !config.as_in(Code::Odrl) {
-            // Split evenly: one source row less than target rows.
+            // The batch is split evenly, so there is one source row less than target rows.
             let rows = Buffer::new(buffer.members().to_vec(), 2 * config.batch - 1)?.with_stream("igdf batch");
             if !prepare(&mut encoders, &rows, config.steps, "IGDF encoders", place, device)? {
                 return Ok(None);
@@ -273,7 +273,7 @@ mod tests {
     use tce_data::{Standardizer, Transitions};
     use tce_nn::{cpu, host, tensor};
 
-    /// Against the definition, a matrix of N rows and 1 + M columns.
+    /// Compares with the definition, a matrix of N rows and 1 + M columns.
     #[test]
     fn the_contrast_follows_its_formula() {
         let (phi, psi) = (vec![1.0, 0.0, 0.5, -1.0], vec![2.0, 1.0, 0.0, 1.0]);
@@ -291,7 +291,7 @@ mod tests {
         assert!((loss - expected / 8.0).abs() < 1e-6, "{loss} is not {}", expected / 8.0);
     }
 
-    /// The same encoders on the same batch: the authors' defect leaves the choice of rows as it is, and of their weights the mean.
+    /// Same encoders, same batch: the authors' defect keeps the same rows, but gives all of them the mean weight.
     #[test]
     fn the_authors_code_weighs_all_rows_alike() {
         let mut t = Transitions::new(2, 1);

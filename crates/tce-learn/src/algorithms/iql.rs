@@ -1,4 +1,4 @@
-//! Implicit Q-learning (Kostrikov et al. 2022), in the form that OTDF and ODRL train and TCE names.
+//! Implicit Q-learning (Kostrikov et al. 2022), in the form that OTDF and ODRL train and the TCE paper refers to.
 //!
 //! ```text
 //! u   = min(Q1', Q2')(s, a) - V(s)                                   before V's step
@@ -10,9 +10,9 @@
 //! L_π = mean of w ℓ(s, a) + β_reg · regulariser                      (10, B.14)   → π
 //! ```
 //!
-//! ℓ = -log π (see [`crate::actor`]); B.14 prints + log π where it must be minus. Each row's weight multiplies that row's
-//! own ℓ; OTDF's and DmC's code multiplies a column of weights with a row of losses, which clones every action with the
-//! mean weight: that is `mean_weight` here.
+//! ℓ = -log π (see [`crate::actor`]); B.14 prints + log π where it must be minus. Each row's weight multiplies that
+//! row's own ℓ. OTDF's and DmC's code multiplies a column of weights by a row of losses, so that every action is cloned
+//! with the mean weight. This is called `mean_weight` here.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -77,7 +77,7 @@ impl Method for IqlConfig {
     }
 }
 
-/// A weight below this does not move a policy.
+/// A weight below this has practically no effect on a policy.
 const DEAD_WEIGHT: f32 = 0.01;
 
 /// IQL of a population.
@@ -94,7 +94,7 @@ impl Iql {
     /// New networks for the members of `buffer`, to be trained for `steps` steps.
     ///
     /// # Errors
-    /// If the configuration cannot be used, or `regulariser` is not of the kind it names.
+    /// If the configuration cannot be used, or `regulariser` is not of the kind that it names.
     pub fn new(
         buffer: &Buffer,
         config: &IqlConfig,
@@ -116,7 +116,7 @@ impl Iql {
         Ok(Self { config: config.clone(), actor, value: Trained::new(value), critics, regulariser })
     }
 
-    /// V(s) `[P, B, 1]`, no part of autodiff.
+    /// V(s) `[P, B, 1]`, outside of autodiff.
     pub fn values(&self, s: Tensor<3>) -> Tensor<3> {
         self.value.net().valid().forward(s)
     }
@@ -125,8 +125,8 @@ impl Iql {
     pub fn step(&mut self, batch: &Minibatch, critic_weights: Option<Tensor<3>>, step: u64, meter: &mut Meter) {
         let Self { config, actor, value, critics, regulariser } = self;
         let sa = state_action(&batch.s, batch.a.clone());
-        // Where there are two threads, one computes value and a critic, the other policy and a critic; they meet in u, in y
-        // and at the end: 8 of 15 network passes instead of 15 (a gradient counts as two).
+        // With two threads, one computes value and a critic, the other policy and a critic. They synchronise at u, at y
+        // and at the end: 8 network passes one after the other instead of 15 (a gradient counts as two).
         let ((q1, v), (q2, output)) = {
             let [one, two] = &critics.pair;
             rayon::join(
@@ -150,7 +150,7 @@ impl Iql {
     }
 }
 
-/// A step down L_V. Returns y, of V after the step.
+/// One step on L_V. Returns y, computed from V after the step.
 fn value_step(
     config: &IqlConfig,
     value: &mut Trained<Mlp>,
@@ -161,12 +161,12 @@ fn value_step(
     let loss = expectile_loss(difference, config.expectile);
     meter.record("value_loss", &loss);
     value.step(loss.sum(), config.critic_lr);
-    // Outside of autodiff: nothing of the forward pass needs to be kept.
+    // Outside of autodiff, because the forward pass needs no gradient.
     let next = value.net().valid().forward(batch.s2.clone());
     batch.r.clone() + batch.not_done.clone() * next * config.discount
 }
 
-/// A step down L_π, from the policy's output and the advantages u at the rows of `batch`.
+/// One step on L_π, given the policy's output and the advantages u at the rows of `batch`.
 fn policy_step(
     c: &IqlConfig,
     (actor, regulariser): (&mut Actor, &Regulariser),

@@ -1,4 +1,4 @@
-//! The configuration of implicit Q-learning, which several methods stand on.
+//! The configuration of implicit Q-learning, which is the basis of several methods.
 
 use serde::{Deserialize, Serialize};
 
@@ -61,7 +61,7 @@ pub struct IqlConfig {
 }
 
 impl IqlConfig {
-    /// Appendix B.2 without the behaviour term: the paper's IQL*. What measures best is in the presets of `tce-run`.
+    /// Appendix B.2 without the behaviour term: the paper's IQL*. The best settings are in the presets of `tce-run`.
     pub fn paper() -> Self {
         Self {
             expectile: 0.7,
@@ -82,10 +82,10 @@ impl IqlConfig {
 }
 
 impl IqlConfig {
-    /// Refuses numbers out of range, and combinations that cannot be trained.
+    /// Returns an error for numbers out of range, and for combinations that cannot be trained.
     ///
     /// # Errors
-    /// Names the field.
+    /// The error names the field.
     pub fn check(&self) -> Result<(), LearnError> {
         within("expectile", self.expectile, 0.0..=1.0)?;
         within("temperature", self.temperature, 0.0..=1e6)?;

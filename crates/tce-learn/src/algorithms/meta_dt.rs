@@ -1,4 +1,4 @@
-//! Meta-DT (Wang et al. 2024) as TCE compares with it (Meta-DT*): without prompts, trained on target and source rows alike.
+//! Meta-DT (Wang et al. 2024) as in the TCE paper's comparison (Meta-DT*): without prompts, on target and source rows.
 //!
 //! ```text
 //! z   = E(the h steps before), L_W = mean (ŝ' - s')² + mean (r̂ - r)²        first, on its own → world model (see world_model)
@@ -6,7 +6,7 @@
 //! L_π = mean over steps and action dimensions of (π_t - a_t)²                → DT
 //! ```
 //!
-//! A member's segments are half from the target, half from the source ([`crate::sequences`]).
+//! Half of a member's segments are from the target, half from the source ([`crate::sequences`]).
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -25,7 +25,7 @@
 //! | h | `world_model.horizon` | 8 | ours: as many steps as the transformer sees |
 //! | - | `world_model.features`, `.gru`, `.latent`, `.hidden` | 16, 128, 16, (128, 128) | Meta-DT; its decoders see s and a through a layer of 16, ours as they are, and both for all robots |
 //!
-//! Rewards are used as they are: a buffer's `reward_scale` is for critics, and `return_scale` does its work here.
+//! Rewards are not scaled: a buffer's `reward_scale` is for critics, and `return_scale` replaces it here.
 
 use std::path::Path;
 
@@ -160,31 +160,31 @@ impl Default for MetaDtConfig {
 }
 
 impl MetaDtConfig {
-    /// Learning rate of the transformer's step `step`.
+    /// Learning rate of the transformer at `step`.
     fn rate(&self, step: u64) -> f64 {
         self.lr * ((step + 1) as f64 / self.warm_up.max(1) as f64).min(1.0)
     }
 }
 
-/// Meta-DT of a population: a member's networks are modules of their own.
+/// Meta-DT of a population. Each member's networks are separate modules.
 pub struct MetaDt {
     config: MetaDtConfig,
     buffer: Buffer,
     device: Device,
-    /// Finished.
+    /// The finished world models.
     worlds: Worlds,
     members: Vec<MemberNets>,
 }
 
 struct MemberNets {
     streams: Streams,
-    /// Of the finished world model.
+    /// Computed with the finished world model.
     contexts: Contexts,
     transformer: Trained<DecisionTransformer>,
 }
 
 impl MetaDt {
-    /// New networks for the members of `buffer`; the world models are trained here. None if the user interrupted that.
+    /// New networks for the members of `buffer`. The world models are trained here. `None` if interrupted.
     ///
     /// # Errors
     /// If the configuration cannot be used, or a checkpoint at `place` cannot be read or written.
@@ -261,13 +261,13 @@ fn policy_loss(actions: Tensor<3>, segments: &Segments, device: &Device) -> Tens
 }
 
 impl Learner for MetaDt {
-    /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
+    /// Ignores the rows of `batch`: a learner of sequences draws its own segments.
     fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, buffer, device, worlds, members } = self;
         let mut metrics = Vec::new();
         for (m, nets) in members.iter_mut().enumerate() {
             let (trajectories, encoder) = worlds.member(m);
-            // Other segments than the world model's.
+            // The indices differ from those of the world model's segments.
             let segments = trajectories.sample(buffer, m, c.world_model.steps + step, [c.batch, c.context, 0]);
             let mut dropout = Dropout::new(c.dropout, nets.streams.indexed("dropout", step));
             let of = Of { trajectories, encoder, buffer, member: m, device };
@@ -332,7 +332,7 @@ mod tests {
     use tce_data::{Standardizer, Transitions};
     use tce_nn::cpu;
 
-    /// Episodes of 7, 1 and 5 steps, of three observations (one of them constant), two actions.
+    /// Episodes of 7, 1 and 5 steps, with three observations (one of them constant) and two actions.
     fn learner() -> (MetaDt, Arc<Transitions>) {
         let mut t = Transitions::new(3, 2);
         let mut row = [0.0; 9];
@@ -357,8 +357,8 @@ mod tests {
         (MetaDt::new(&buffer, &config, Place::NONE, &cpu()).unwrap().unwrap(), t)
     }
 
-    /// The loss of a batch, from the actions of the finished policy as it is led through the table's episodes step by step: what
-    /// training computes is what an evaluation computes, and the loss is the mean over the steps that are there.
+    /// The loss of a batch equals that of the finished policy's actions, run step by step through the table's episodes:
+    /// training computes what an evaluation computes, and the loss is the mean over existing steps.
     #[test]
     fn the_loss_is_that_of_the_policy_that_acts() {
         let (mut learner, t) = learner();
@@ -366,13 +366,13 @@ mod tests {
         let mut errors = Vec::new();
         for episode in t.episodes() {
             let PolicyKind::Sequence(sequence) = policy.kind_mut() else { panic!("a policy with a memory") };
-            // What the data got in this episode is what the policy is asked for.
+            // The policy is asked for the return that the data have in this episode.
             let mut memory = sequence.asked(episode.episode_return).start();
             let mut a = [0.0; 2];
             for i in episode.start..episode.end {
                 sequence.act(t.observation(i), &mut [&mut memory], &mut a);
                 errors.push(a.iter().zip(t.action(i)).map(|(a, b)| (a - b).powi(2)).sum::<f32>());
-                // As if it had done what the data did.
+                // The policy's memory gets the action of the data.
                 memory.act(t.action(i));
                 memory.reward(t.rewards[i].into());
             }
@@ -390,7 +390,7 @@ mod tests {
             begin(row).max((row + 1).saturating_sub(3))..row + 1
         });
         let rows: Vec<_> = rows.collect();
-        // The policy sees three steps, a segment's later steps as well; a segment that begins within an episode sees fewer.
+        // The policy sees three steps, as do a segment's later steps; segments that start within an episode see fewer.
         let whole: Vec<_> = segments.picks.iter().map(|p| p.row as usize).collect();
         assert!(rows.len() > whole.len());
         let per_step = host(actions);

@@ -1,6 +1,7 @@
-//! What makes a learner of a configuration: one implementation an algorithm, in the algorithm's file.
+//! Builds a learner from a configuration. There is one implementation per algorithm, in the algorithm's file.
 //!
-//! A further algorithm is a file with a configuration that implements [`Method`], and a line in the registry (`tce-run/src/learners.rs`).
+//! To add an algorithm, write a file with a configuration that implements [`Method`], and add a line to the registry
+//! (`tce-run/src/learners.rs`).
 
 use std::fmt;
 
@@ -15,7 +16,7 @@ use crate::policy::PolicyLearner;
 use crate::regulariser::{Regulariser, RegulariserConfig};
 use crate::training::Place;
 
-/// A learner, as `tce learn --list` prints it and as checks before a training ask for it.
+/// Information about a learner, for `tce learn --list` and for checks before a training run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct About {
     /// Its name on the command line and in `learner.algorithm`.
@@ -23,46 +24,46 @@ pub struct About {
     /// Its name in tables.
     #[serde(skip)]
     pub title: &'static str,
-    /// One line.
+    /// A description in one line.
     pub description: &'static str,
-    /// Whose it is.
+    /// The reference for the method.
     pub reference: &'static str,
-    /// How `mode = "published"` differs; none where there is one form.
+    /// How `mode = "published"` differs; `None` if the method has only one form.
     pub published: Option<&'static str>,
-    /// The table of its keys.
+    /// The table of its configuration keys.
     pub table: &'static str,
-    /// What the rows besides the target's must have.
+    /// Requirements on the rows other than the target's.
     pub needs: OtherRows,
-    /// Whether it looks at s' of terminal rows: it models the dynamics, or compares transitions of two domains.
+    /// Whether it uses s' of terminal rows, because it models the dynamics or compares transitions of two domains.
     #[serde(skip)]
     pub successors: bool,
-    /// Whether it follows episodes, so that rows must be in order.
+    /// Whether it uses episodes, so that rows must be in order.
     #[serde(skip)]
     pub episodes: bool,
-    /// By which numbers it chooses among other rows.
+    /// The scores by which it selects other rows.
     #[serde(skip)]
     pub scores: RowScores,
 }
 
-/// The numbers of other rows that a learner gets ([`crate::Member::row_scores`]).
+/// The scores of other rows that a learner gets ([`crate::Member::row_scores`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RowScores {
-    /// None.
+    /// No scores.
     None,
-    /// The negated cost of transport to the target's rows.
+    /// The negative cost of transport to the target's rows.
     Transport,
     /// DmC's density-ratio scores.
     Density,
 }
 
-/// What the rows besides the target's must have.
+/// Requirements on the rows other than the target's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OtherRows {
-    /// Nothing: any rows, or none.
+    /// No requirements: any rows, or none.
     Any,
-    /// They are the source's: the learner compares the domains.
+    /// They must be source rows, because the learner compares the domains.
     Source,
-    /// They have scores.
+    /// They must have scores.
     Scored,
 }
 
@@ -82,25 +83,25 @@ impl Serialize for OtherRows {
     }
 }
 
-/// What a learner is made from, besides its own configuration.
+/// Inputs from which a learner is built, in addition to its own configuration.
 #[derive(Clone, Copy)]
 pub struct Setup<'a> {
     /// Members and batches.
     pub buffer: &'a Buffer,
     /// Training steps.
     pub steps: u64,
-    /// The IQL that several methods stand on.
+    /// The IQL configuration on which several methods are based.
     pub iql: &'a IqlConfig,
     /// The model of the target's behaviour, for regularisers.
     pub behaviour: &'a RegulariserConfig,
-    /// Where checkpoints of what is trained before the first step are kept.
+    /// Where checkpoints of preparations (training before the first step) are stored.
     pub place: Place<'a>,
-    /// What computes the networks.
+    /// The device that computes the networks.
     pub device: &'a Device,
 }
 
 impl Setup<'_> {
-    /// The regulariser of `method`, trained now where it has to be. None if the user interrupted it.
+    /// The regulariser of `method`. If it needs training, it is trained now. `None` if the user interrupted this.
     ///
     /// # Errors
     /// If the configuration cannot be used, or a checkpoint cannot be read or written.
@@ -110,43 +111,43 @@ impl Setup<'_> {
     }
 }
 
-/// What [`Method::build`] gives: a learner, or None if the user interrupted what is trained before.
+/// The result of [`Method::build`]: a learner, or `None` if the user interrupted its preparation.
 pub type Built = Result<Option<Box<dyn PolicyLearner>>, LearnError>;
 
-/// The configuration of an algorithm, of which a learner can be made.
+/// The configuration of an algorithm, from which a learner can be built.
 pub trait Method {
-    /// What it is.
+    /// Information about the method.
     fn about(&self) -> About;
 
-    /// Refuses numbers out of range.
+    /// Returns an error for numbers out of range.
     ///
     /// # Errors
-    /// Names the field.
+    /// The error names the field.
     fn check(&self) -> Result<(), LearnError>;
 
-    /// A learner before its first step; what it needs for that is trained here.
+    /// Builds a learner before its first step. Models that it needs are trained here.
     ///
     /// # Errors
     /// If the configuration or the data cannot be used.
     fn build(&self, on: &Setup<'_>) -> Built;
 
-    /// Whether it is trained as its public code has it, where that differs from its paper; None where there is one form.
+    /// Whether it is trained as in its public code or as in its paper; `None` if the method has only one form.
     fn mode(&self) -> Option<Mode> {
         None
     }
 
-    /// The IQL that it makes of `iql`, where it stands on it.
+    /// The IQL configuration that it derives from `iql`, if it is based on IQL.
     fn backbone(&self, iql: &IqlConfig) -> Option<IqlConfig> {
         let _ = iql;
         None
     }
 
-    /// The behaviour model that it makes of `base`.
+    /// The configuration of the behaviour model that it derives from `base`.
     fn behaviour(&self, base: &RegulariserConfig) -> RegulariserConfig {
         base.clone()
     }
 
-    /// Training steps of the `steps` that were asked for, by whether there are rows besides the target's.
+    /// Number of training steps, given the requested `steps` and whether there are rows other than the target's.
     fn steps(&self, steps: u64, mixed: bool) -> u64 {
         let _ = mixed;
         steps

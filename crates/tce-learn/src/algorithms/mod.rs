@@ -1,4 +1,4 @@
-//! One file per algorithm, and what several of them share.
+//! One file per algorithm, and the code that several of them share.
 
 pub mod bc;
 pub mod bosa;

@@ -1,4 +1,4 @@
-//! Methods that are IQL on other batches: what they do to a batch is theirs, everything else is [`crate::iql`]'s.
+//! Methods that are IQL on modified batches. A method changes only the batch; the rest is [`crate::iql`].
 
 use std::path::Path;
 
@@ -9,9 +9,9 @@ use crate::iql::Iql;
 use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Learner, Meter};
 
-/// What a method does to a batch before IQL learns from it.
+/// Changes a batch before IQL learns from it.
 pub trait BatchTransform: Send {
-    /// The batch of `step` that IQL gets, and what multiplies the rows of its L_Q. Networks of the method's own are trained here.
+    /// Returns the batch of `step` for IQL and its rows' weights in L_Q. The method's own networks are trained here.
     fn transform(
         &mut self,
         iql: &Iql,
@@ -20,10 +20,10 @@ pub trait BatchTransform: Send {
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>);
 
-    /// Adds networks of its own to `state`.
+    /// Adds the method's own networks to `state`.
     fn save(&self, _state: &mut NamedParameters) {}
 
-    /// Takes them from `state`; `path` is where it came from, for messages.
+    /// Restores them from `state`; `path` is its file, for messages.
     ///
     /// # Errors
     /// If they belong to other networks.

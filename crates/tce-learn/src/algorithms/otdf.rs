@@ -1,4 +1,4 @@
-//! OTDF (Lyu et al. 2025): source rows are kept by their cost in the optimal transport to the target rows.
+//! OTDF (Lyu et al. 2025): keeps source rows with a low cost in the optimal transport to the target rows.
 //!
 //! ```text
 //! d_i = -Σ_j P_ij C_ij for every source row, from tce_data::transport_costs on [s, a, s']
@@ -17,14 +17,14 @@
 //! | d | `row_scores` of a [`crate::Member`] | - | a number per source row |
 //! | everything else | `learner.iql` | - | OTDF's IQL, but for what the preset changes in it (below) |
 //!
-//! **Published**: a column of weights times a row of losses, in other words filtered cloning with a regulariser: the advantages have
-//! no effect on which action is cloned ([`PolicyExtraction::MeanWeight`]).
+//! **Published**: the code multiplies a column of weights by a row of losses. The result is filtered cloning with a
+//! regulariser: the advantages have no effect on which action is cloned ([`PolicyExtraction::MeanWeight`]).
 //!
-//! **β_reg is relative to the weights of cloning.** OTDF has min(exp(3 u), 100) of raw advantages: a tenth of them at 100 on HalfCheetah, so 10 or
-//! more on average. The preset `default` has exp(u / std u), 1.2 to 1.5 on average, and there the same β_reg holds the policy several
-//! times harder. `--preset paper` has OTDF's scale.
+//! **β_reg is relative to the weights of cloning.** OTDF uses min(exp(3 u), 100) of raw advantages. On HalfCheetah a
+//! tenth of these weights are 100, so their mean is 10 or more. The preset `default` uses exp(u / std u), with a mean
+//! of 1.2 to 1.5. There the same β_reg constrains the policy several times more. `--preset paper` has OTDF's scale.
 //!
-//! OTDF's loader also takes the next row for s', across the ends of episodes; this is not repeated here.
+//! OTDF's loader also uses the next row as s' across the ends of episodes; this is not repeated here.
 
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
@@ -101,14 +101,14 @@ impl Default for OtdfConfig {
 }
 
 impl OtdfConfig {
-    /// The IQL that this configuration makes of `iql`.
+    /// The IQL configuration that this configuration derives from `iql`.
     pub fn backbone(&self, iql: &IqlConfig) -> IqlConfig {
         otdf_policy(iql, self.mode, self.beta_reg)
     }
 }
 
-/// IQL with the policy of OTDF, which DmC takes over: tanh-Gaussian, squared errors summed over the action's components, and the
-/// behaviour CVAE as its regulariser.
+/// IQL with the policy of OTDF, which DmC also uses: a tanh-Gaussian, squared errors summed over the action's
+/// components, and the behaviour CVAE as its regulariser.
 pub(crate) fn otdf_policy(iql: &IqlConfig, mode: Mode, beta_reg: f64) -> IqlConfig {
     let policy_extraction = match mode {
         Mode::Published => PolicyExtraction::MeanWeight,
@@ -122,7 +122,7 @@ pub(crate) fn otdf_policy(iql: &IqlConfig, mode: Mode, beta_reg: f64) -> IqlConf
 /// OTDF of a population.
 pub type Otdf = OnIql<Transported>;
 
-/// The source rows that are cheap to transport.
+/// Keeps the source rows with a low cost of transport.
 pub struct Transported {
     config: OtdfConfig,
     members: Vec<Member>,
@@ -132,7 +132,7 @@ impl Otdf {
     /// New networks for the members of `buffer`, to be trained for `steps` steps. `regulariser` is of the kind `otdf`.
     ///
     /// # Errors
-    /// If a configuration cannot be used, or there are no source rows or no costs of them.
+    /// If a configuration cannot be used, or there are no source rows or they have no costs.
     pub fn new(
         buffer: &Buffer,
         config: &OtdfConfig,
@@ -148,7 +148,7 @@ impl Otdf {
     }
 }
 
-/// d̂ for the `others` source rows of every member, in place; 0 for all where they are equal.
+/// Replaces d by d̂ for the `others` source rows of every member; 0 for all if they are equal.
 pub fn normalise(d: &mut [f32], others: usize) {
     for d in d.chunks_mut(others.max(1)) {
         let (low, high) = d.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));

@@ -1,4 +1,4 @@
-//! ReBRAC (Tarasov et al. 2023): TD3+BC with a penalty in the critics' target too, and critics with layer normalisation.
+//! ReBRAC (Tarasov et al. 2023): TD3+BC with a penalty in the critics' target, too, and layer-normalised critics.
 //!
 //! ```text
 //! a'  = clip(π'(s') + clip(σ n, ±c), ±1)
@@ -7,8 +7,8 @@
 //! every d-th step:  L_π = β_π mean |π(s) - a|² - mean min(Q1, Q2)(s, π(s)) / mean |min(Q1, Q2)|   → π;  Q', π' follow
 //! ```
 //!
-//! a'_data is the action of the next row. Where the data do not tell it (the end of an episode, a generated row, a row whose
-//! neighbour was left out) the penalty is left out.
+//! a'_data is the action of the next row. If the data do not contain it (the end of an episode, a generated row, a row
+//! whose next row was left out), there is no penalty.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -106,10 +106,10 @@ impl Default for RebracConfig {
 /// ReBRAC of a population.
 pub type Rebrac = Deterministic<Penalties>;
 
-/// The penalties of both sides.
+/// The penalties of the policy and the critics.
 pub struct Penalties {
     config: RebracConfig,
-    /// Where the next actions are looked up.
+    /// The next actions are read from it.
     buffer: Buffer,
 }
 
@@ -146,7 +146,7 @@ impl UpdateRule for Penalties {
             let (q1, q2) = rayon::join(|| one.frozen(sa.clone()), || two.frozen(sa.clone()));
             let q = q1.min_pair(q2);
             drop(sa);
-            // The sum over components, where `squared_loss` takes their mean.
+            // The penalty is a sum over components, but `squared_loss` returns their mean.
             let cloning = Actor::squared_loss(&output, batch.a.clone()) * batch.a.dims()[2] as f64;
             meter.record("policy_value", &q);
             meter.record("cloning_loss", &cloning);

@@ -1,4 +1,4 @@
-//! What keeps a policy near the behaviour of the target data: the second term of Eq. 10 and B.14, and OTDF's.
+//! Keeps a policy close to the behaviour of the target data: the second term of Eq. 10 and B.14, and OTDF's term.
 //!
 //! ```text
 //! forward_kl  E over target states s of KL(π_b(·|s) ‖ π(·|s)) = E over â ~ π_b(·|s) of -log π(â|s) - H(π_b)
@@ -8,8 +8,8 @@
 //!
 //! π_b is the behaviour CVAE ([`crate::cvae`]). The entropy of π_b does not depend on the policy. For a deterministic
 //! policy -log π(â|s) is the squared error, as in the first term of the loss (up to the same constants). Actions of π_b
-//! are drawn before the training, `draws` per target row; step t uses draw t mod `draws` of each row in its batch.
-//! OTDF leaves out - ln K and the prior and posterior densities of z; so do we.
+//! are drawn before training, `draws` per target row; step t uses draw t mod `draws` of each row in its batch. Like
+//! OTDF, we omit - ln K and the prior and posterior densities of z.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -62,15 +62,15 @@ impl RegulariserConfig {
     }
 }
 
-/// A term, ready to be used.
+/// A prepared term.
 pub enum Regulariser {
     /// No term.
     None,
     /// Actions of π_b for every target row.
     ForwardKl {
-        /// Per member `[rows, draws, d_a]`.
+        /// For each member, `[rows, draws, d_a]`.
         actions: Vec<Vec<f32>>,
-        /// Per row.
+        /// Number of draws per row.
         draws: usize,
     },
     /// The behaviour model itself.
@@ -81,16 +81,16 @@ pub enum Regulariser {
         samples: usize,
         /// β
         std: f64,
-        /// For z.
+        /// Random streams for z.
         members: Vec<Streams>,
     },
 }
 
 impl Regulariser {
-    /// Trains what the term needs, on the target rows of `buffer`. None if the user interrupted it.
+    /// Trains the model that the term needs, on the target rows of `buffer`. `None` if the user interrupted it.
     ///
     /// # Errors
-    /// If the configuration cannot be used, or a checkpoint not be read or written.
+    /// If the configuration cannot be used, or a checkpoint cannot be read or written.
     pub fn prepare(
         kind: RegulariserKind,
         buffer: &Buffer,
@@ -137,7 +137,7 @@ impl Regulariser {
         }
     }
 
-    /// The term, per member; `output` is the policy at the batch's states.
+    /// The term, per member; `output` is the policy's output at the batch's states.
     pub fn loss(&self, actor: &Actor, output: &PolicyOutput, batch: &Minibatch, step: u64) -> Option<Tensor<3>> {
         let [p, b, _] = batch.s.dims();
         let (a, device) = (batch.a.dims()[2], batch.s.device());

@@ -1,4 +1,4 @@
-//! Soft actor-critic (Haarnoja et al. 2018, 2019): how D4RL made its data, and how this project makes its own.
+//! Soft actor-critic (Haarnoja et al. 2018, 2019). It collected D4RL's data, and collects this project's own.
 //!
 //! ```text
 //! a'  ~ π(·|s');  y = r + γ (1 - terminal) (min(Q1', Q2')(s', a') - α ln π(a'|s'))
@@ -49,19 +49,19 @@ pub struct SacConfig {
     pub polyak: f64,
     /// Learning rate.
     pub lr: f64,
-    /// The policy's own, where it is another: a policy that is good already should not leave what its critics know.
+    /// The policy's own learning rate, if different: a good policy should not move away from what its critics know.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub policy_lr: Option<f64>,
     /// Hidden layers of policy and critics.
     pub hidden: Vec<usize>,
-    /// Layer normalisation in the critics: between actions that were tried they then say nothing extreme (Ball et al. 2023).
+    /// Layer normalisation in the critics. It avoids extreme values between tried actions (Ball et al. 2023).
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub layer_norm: bool,
-    /// H̄; none means -d_a.
+    /// H̄; `None` means -d_a.
     pub target_entropy: Option<f64>,
     /// α before the first step.
     pub initial_alpha: f64,
-    /// Updates of the critics before the first of policy and α. New critics know nothing of a trained policy, and would spoil it.
+    /// Updates of the critics before the first update of policy and α. New critics would spoil a trained policy.
     pub policy_start: u64,
 }
 
@@ -74,7 +74,7 @@ impl Default for SacConfig {
     }
 }
 
-/// How many times faster the target critics follow while the policy stands still: values have to come up from 0 by 1 / (1 - γ) steps,
+/// Factor on the speed of the target critics while the policy is fixed. Values must rise from 0 over 1 / (1 - γ) steps,
 /// each of which takes 1 / ρ updates.
 const EAGER: f64 = 4.0;
 
@@ -96,7 +96,7 @@ pub struct Sac {
 }
 
 impl Sac {
-    /// New networks for the members of `buffer`, whose rows may grow while it learns.
+    /// New networks for the members of `buffer`, to which rows may be added during training.
     ///
     /// # Errors
     /// If the configuration cannot be used.
@@ -128,15 +128,15 @@ impl Sac {
         })
     }
 
-    /// One action per member for one observation per member, `[P, inputs]` as the networks see it: sampled, with the
-    /// noise `step` of each member's stream `exploration`. Row-major `[P, d_a]`.
+    /// Returns one action per member for one observation per member, `[P, inputs]` as network inputs. Actions are
+    /// sampled with the noise `step` of each member's stream `exploration`. Row-major `[P, d_a]`.
     pub fn act(&self, observations: &[f32], step: u64) -> Vec<f32> {
         let p = self.members.len();
         let s = tensor(observations.to_vec(), [p, 1, observations.len() / p], &self.device);
         host(self.actor.frozen(s).sample_with_log_prob(&self.members, "exploration", step).0)
     }
 
-    /// Begins with the weights of a trained policy, from `path`.
+    /// Starts from the weights of a trained policy, read from `path`.
     ///
     /// # Errors
     /// As [`Actor::begin_with`].
@@ -144,7 +144,7 @@ impl Sac {
         self.actor.begin_with(policy, path)
     }
 
-    /// Where it computes; batches are made there.
+    /// The device of the networks; batches are created on it.
     pub fn device(&self) -> Device {
         self.device.clone()
     }
@@ -160,8 +160,8 @@ impl Learner for Sac {
         let Self { config: c, target_entropy, actor, critics, temperature, members, .. } = self;
         let alpha = temperature.net().log_alpha.val().inner().exp();
 
-        // L_Q; the policy at s is computed meanwhile, for it needs nothing of it.
-        // Not drawn where nothing follows: a graph that nobody goes back through stays with autodiff, and slows it down.
+        // L_Q. The policy at s is computed in parallel, because it does not depend on L_Q. It is skipped if the policy
+        // does not learn: autodiff keeps a graph without a backward pass, which slows it down.
         let policy_learns = step >= c.policy_start;
         let (y, drawn) = rayon::join(
             || {
@@ -176,7 +176,7 @@ impl Learner for Sac {
         let loss = critics.step(state_action(&batch.s, batch.a.clone()), y, None, c.lr, polyak);
         meter.record("critic_loss", &loss);
 
-        // L_π: gradients reach the action through the critics, whose weights stay.
+        // L_π: gradients reach the action through the critics, whose weights do not change.
         let Some((a, log_prob)) = drawn else { return };
         let sa = state_action(&batch.s, a);
         let [one, two] = &critics.pair;

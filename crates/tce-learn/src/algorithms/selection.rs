@@ -1,4 +1,4 @@
-//! Choosing among the rows of a batch: what IGDF, OTDF and DmC do with source rows at every step.
+//! Selection among the rows of a batch: IGDF, OTDF and DmC select source rows at every step.
 
 use tce_nn::{Tensor, host, tensor};
 
@@ -7,14 +7,14 @@ use crate::error::LearnError;
 use crate::losses::member_mean;
 use crate::training::Meter;
 
-/// So many of `others` rows are kept at the share `keep`: ⌊keep · others⌋, at least one.
+/// Number of `others` rows that are kept at the share `keep`: ⌊keep · others⌋, at least one.
 pub fn kept_rows(keep: f64, others: usize) -> usize {
-    // .8 · 5 is 4.000…01 or 3.999…9, depending on how it was written.
+    // .8 · 5 may be 4.000…01 or 3.999…9, depending on how it is computed.
     ((keep * others as f64 + 1e-9).floor() as usize).clamp(1, others.max(1))
 }
 
-/// For every member, all target rows of a batch and the `count` others with the greatest `scores`, ascending; equal scores: the
-/// earlier row. `scores` holds one number per row that is not a target row, members one after the other.
+/// For every member, the indices of all target rows of a batch and the `count` others with the highest `scores`,
+/// ascending. Ties go to the earlier row. `scores` has one number per row that is not a target row, sorted by member.
 pub fn best_others(target_rows: usize, scores: &[f32], others: usize, count: usize) -> Vec<Vec<usize>> {
     let choose = |scores: &[f32]| {
         let mut order: Vec<usize> = (0..others).collect();
@@ -26,17 +26,17 @@ pub fn best_others(target_rows: usize, scores: &[f32], others: usize, count: usi
     scores.chunks(others.max(1)).map(choose).collect()
 }
 
-/// A batch without its worse source rows, and what multiplies each row of L_Q.
+/// A batch without its worse source rows, and the weights of its rows in L_Q.
 pub struct Selected {
-    /// Target rows, then the source rows that were kept.
+    /// Target rows, then the kept source rows.
     pub batch: Minibatch,
     /// `[P, B', 1]`: 1 for target rows.
     pub weights: Tensor<3>,
 }
 
 impl Selected {
-    /// Keeps the share `keep` of the rows that are not the target's, those with the greatest `scores` (as
-    /// [`best_others`] takes them); row i of them weighs `weight(scores[i])`.
+    /// Keeps the share `keep` of the rows that are not the target's, those with the highest `scores` (in the format of
+    /// [`best_others`]). Row i of them has the weight `weight(scores[i])`.
     pub fn new(batch: &Minibatch, scores: &[f32], keep: f64, weight: impl Fn(f32) -> f32) -> Self {
         let [p, b, _] = batch.s.dims();
         let (first, others) = (batch.target_rows, b - batch.target_rows);
@@ -48,14 +48,14 @@ impl Selected {
         Self { weights: tensor(weights, [p, kept, 1], &batch.s.device()), batch: batch.keep(&rows) }
     }
 
-    /// As [`crate::on_iql::BatchTransform`] hands it on; the mean weight goes to `meter`.
+    /// The result in the form of [`crate::on_iql::BatchTransform`]; records the mean weight in `meter`.
     pub(crate) fn recorded(self, meter: &mut Meter) -> (Minibatch, Option<Tensor<3>>) {
         meter.record("critic_weight", &member_mean(self.weights.clone()));
         (self.batch, Some(self.weights))
     }
 }
 
-/// The numbers of the members' `row_scores` for the rows of `batch` that are not target rows, members one after the other.
+/// The members' `row_scores` for the rows of `batch` that are not target rows, sorted by member.
 pub fn scores_of_others(members: &[crate::Member], batch: &Minibatch) -> Vec<f32> {
     let b = batch.s.dims()[1];
     let of = |(member, picks): (&crate::Member, &[crate::Pick])| -> Vec<f32> {
@@ -65,7 +65,7 @@ pub fn scores_of_others(members: &[crate::Member], batch: &Minibatch) -> Vec<f32
     members.iter().zip(batch.picks.chunks(b)).flat_map(of).collect()
 }
 
-/// Refuses members without source rows, which `method` cannot do without.
+/// Returns an error for members without source rows, which `method` needs.
 pub(crate) fn need_others(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
     match members.iter().position(|m| m.parts.len() != 2 || m.parts[1].is_empty()) {
         None => Ok(()),
@@ -82,7 +82,7 @@ fn m_parts(member: &crate::Member) -> usize {
     member.parts.iter().filter(|p| !p.is_empty()).count()
 }
 
-/// Refuses members without a number per source row.
+/// Returns an error for members without a score for every source row.
 pub(crate) fn need_scores(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
     need_others(method, members)?;
     for (m, member) in members.iter().enumerate() {
@@ -102,7 +102,7 @@ pub(crate) fn need_scores(method: &str, members: &[crate::Member]) -> Result<(),
     Ok(())
 }
 
-/// The entries of `x` `[P, B, 1]` from row `first` on, members one after the other.
+/// The entries of `x` `[P, B, 1]` from row `first` on, sorted by member.
 pub(crate) fn host_from(x: Tensor<3>, first: usize) -> Vec<f32> {
     let rows = x.dims()[1];
     host(x.narrow(1, first, rows - first))
@@ -118,7 +118,7 @@ mod tests {
         assert_eq!((kept_rows(0.8, 128), kept_rows(0.75, 128), kept_rows(0.8, 5), kept_rows(0.1, 5)), (102, 96, 4, 1));
     }
 
-    /// Two members; every row carries its own number as state and reward, so that it can be told where it went.
+    /// Two members. Every row has its own number as state and reward, so that it can be identified.
     #[test]
     fn rows_keep_their_weights() {
         let column = |v: &[f32]| tensor(v.to_vec(), [2, 5, 1], &tce_nn::cpu());
@@ -142,7 +142,7 @@ mod tests {
     }
 
     proptest! {
-        /// Against the definition: nothing that was left out is better than what was kept.
+        /// Compares with the definition: no row that was left out is better than a kept one.
         #[test]
         fn what_is_kept_is_the_best(scores in prop::collection::vec(-3i8..3, 24), target in 0usize..4, count in 1usize..12) {
             let scores: Vec<f32> = scores.into_iter().map(f32::from).collect();

@@ -1,4 +1,4 @@
-//! SRPO (Xue et al. 2023) on IQL, as IGDF's authors compare it: rewards are raised where the state looks like one of high value.
+//! SRPO (Xue et al. 2023) on IQL, as IGDF's authors compare it: raises rewards of states that resemble high-value ones.
 //!
 //! ```text
 //! rows of a batch ranked by V(s): the best share ρ gets label 1, the rest 0
@@ -15,11 +15,11 @@
 //! | - | `lr` | 1e-3 | the same |
 //! | - | `mode` | corrected | published: x is the logit D(s) itself |
 //!
-//! IGDF's authors stand it on another IQL (Gaussian log-likelihood for the policy: `learner.iql.policy_extraction = "awr_logprob"`); here all
-//! prior methods stand on the same one.
+//! IGDF's authors base it on another IQL (Gaussian log-likelihood for the policy:
+//! `learner.iql.policy_extraction = "awr_logprob"`); here all prior methods use the same IQL.
 //!
-//! **Published**: the logit is clamped where the odds are meant. Every state with D(s) ≤ .1 (odds below 1.1) then loses λ ln 10,
-//! however unlike it is, and ln of a logit grows hardly at all.
+//! **Published**: the code clamps the logit instead of the odds. Every state with D(s) ≤ .1 (odds below 1.1) then loses
+//! λ ln 10, however dissimilar it is, and the logarithm of a logit hardly grows.
 
 use std::path::Path;
 
@@ -135,7 +135,7 @@ impl Srpo {
     }
 }
 
-/// 1 for the share `share` of the rows with the greatest values, per member; `[P, B, 1]` as `values`.
+/// 1 for the share `share` of the rows with the highest values, per member, 0 for the others; `[P, B, 1]` as `values`.
 pub fn high_value_labels(values: Tensor<3>, share: f64) -> Tensor<3> {
     let ([p, b, _], device) = (values.dims(), values.device());
     let mut labels = vec![0.0; p * b];
@@ -150,7 +150,7 @@ pub fn reward_shift(logits: Tensor<3>, config: &SrpoConfig) -> Tensor<3> {
     let (low, high) = (1.0 / config.clip, config.clip);
     let log = match config.mode {
         Mode::Published => logits.clamp(low, high).log(),
-        // ln clip(exp D, 1/c, c) without the detour, which overflows.
+        // ln clip(exp D, 1/c, c), computed without the exponential, which would overflow.
         Mode::Corrected => logits.clamp(low.ln(), high.ln()),
     };
     log * config.lambda

@@ -1,4 +1,4 @@
-//! TD3+BC (Fujimoto and Gu 2021): a deterministic actor-critic whose policy is held to the actions of the data.
+//! TD3+BC (Fujimoto and Gu 2021): a deterministic actor-critic whose policy is kept close to the actions of the data.
 //!
 //! ```text
 //! a'  = clip(π'(s') + clip(σ n, ±c), ±1);  y = r + γ (1 - terminal) min(Q1', Q2')(s', a')
@@ -6,7 +6,7 @@
 //! every d-th step:  L_π = mean ℓ(s, a) - (α / mean |Q1(s, π(s))|) mean Q1(s, π(s))   → π;  Q', π' follow
 //! ```
 //!
-//! ℓ = (π(s) - a)², mean over components ([`crate::actor`]); the divisor of α gets no gradient.
+//! ℓ = (π(s) - a)², mean over components ([`crate::actor`]); there is no gradient through the divisor of α.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -109,7 +109,7 @@ impl Td3Bc {
     }
 }
 
-/// mean Q / mean |Q| per member, the divisor without gradient: the same scale whatever the rewards' is. `q` `[P, B, 1]`.
+/// mean Q / mean |Q| per member, no gradient through the divisor: independent of the rewards' scale. `q` `[P, B, 1]`.
 pub fn normalised_value(q: Tensor<3>) -> Tensor<3> {
     let scale = member_mean(q.clone().inner().abs()).clamp_min(1e-8);
     member_mean(q) / Tensor::from_inner(scale)
@@ -146,7 +146,7 @@ mod tests {
         let q = tensor(vec![2.0, -1.0, 5.0], [1, 3, 1], &cpu().autodiff()).require_grad();
         let value = normalised_value(q.clone());
         assert!((host(value.clone().inner())[0] - 6.0 / 8.0).abs() < 1e-6);
-        // mean |Q| = 8/3 is a constant to the gradient: 1/3 · 3/8.
+        // The gradient treats mean |Q| = 8/3 as a constant: 1/3 · 3/8.
         let gradient = host(q.grad(&value.sum().backward()).unwrap());
         assert!(gradient.iter().all(|g| (g - 0.125).abs() < 1e-6), "{gradient:?}");
     }

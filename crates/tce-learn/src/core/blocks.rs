@@ -1,15 +1,15 @@
-//! Evaluating networks on whole tables, members side by side, a block of rows at a time.
+//! Evaluates networks on whole tables, all members in parallel, in blocks of rows.
 
 use tce_nn::{Device, Tensor, host, tensor};
 
-/// Rows per block. Part of the definition of results that draw noise per block.
+/// Rows per block. It is part of the definition of results that draw noise per block.
 const BLOCK: usize = 1024;
 
-/// Applies `f` to the rows of every member's table and returns what it gives, per member, row-major.
+/// Applies `f` to the rows of every member's table and returns its results, per member, row-major.
 ///
-/// `tables[m]` holds rows of `width`; members may have different numbers of rows (shorter ones are padded with zeros
-/// and the results dropped). `f` gets the index of the block and `[P, rows, width]`, and returns `[P, k · rows, ·]` with
-/// the k results of a row together.
+/// `tables[m]` holds rows of `width`. Members may have different numbers of rows (shorter tables are padded with zeros
+/// and the results dropped). `f` gets the index of the block and `[P, rows, width]`, and returns `[P, k · rows, ·]`
+/// with the k results of a row together.
 pub fn map_rows(
     tables: &[Vec<f32>],
     width: usize,

@@ -1,13 +1,13 @@
-//! The rows a learner trains on, and minibatches of them for a whole population.
+//! The rows that a learner trains on, and minibatches of them for a whole population.
 //!
 //! | concept | here |
 //! |---|---|
 //! | D_tar, D_mix | the parts of a [`Member`]: part 0 is the target, the others are source or generated rows |
-//! | 128 + 128 rows (Table C.4) | the batch is split evenly over the parts that are there; one part alone gives all rows |
+//! | 128 + 128 rows (Table C.4) | the batch is split evenly over the existing parts; a single part gives all rows |
 //! | observation standardisation | applied when a row is drawn: raw and standardised members share one table in memory |
 //! | reward scale | likewise |
 //!
-//! Member m draws the rows of step t from its stream `batch`, index t: a run resumed at t draws what it would have drawn.
+//! Member m draws the rows of step t from its stream `batch`, index t. A run resumed at t draws the same rows.
 
 use std::sync::Arc;
 
@@ -20,47 +20,47 @@ use tce_nn::{Device, Tensor, tensor};
 
 use crate::error::LearnError;
 
-/// What one member of a population learns from.
+/// The data of one member of a population.
 #[derive(Clone, Debug)]
 pub struct Member {
-    /// Everything random of this member: initial weights, batches, noise.
+    /// Random streams of this member: initial weights, batches, noise.
     pub streams: Streams,
-    /// The data sets, the target's first. Members may share them.
+    /// The data sets; the target's is the first. Members may share them.
     pub parts: Vec<Arc<Transitions>>,
-    /// How observations reach the networks; [`Standardizer::identity`] for raw ones. Its `dead` dimensions are not
-    /// shown to the networks if they are dead for every member, so a raw member may name them too.
+    /// Standardises observations for the networks; [`Standardizer::identity`] for raw ones. Its `dead` dimensions are
+    /// hidden from the networks if they are dead for every member, so a raw member may list them, too.
     pub standardizer: Standardizer,
-    /// Factor on every reward; 1 for none, see [`return_range_scale`].
+    /// Factor on every reward; 1 for no scaling, see [`return_range_scale`].
     pub reward_scale: f32,
-    /// One number per row of part 1, where an algorithm weighs or filters these rows: a transport cost, a score. A batch's rows
-    /// find theirs by [`Minibatch::picks`].
+    /// One number per row of part 1, if an algorithm weighs or filters these rows: a transport cost, a score.
+    /// [`Minibatch::picks`] gives the indices of a batch's rows.
     pub row_scores: Option<Arc<Vec<f32>>>,
 }
 
-/// Members side by side, with the same dimensions and batch size.
+/// The data of all members, which have the same dimensions and batch size.
 #[derive(Clone, Debug)]
 pub struct Buffer {
     members: Vec<Member>,
     batch: usize,
     inputs: Vec<usize>,
     act_dim: usize,
-    /// The stream of batches.
+    /// The name of the random stream for batches.
     stream: &'static str,
 }
 
-/// The row a batch entry came from.
+/// The origin of a batch entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pick {
     /// Index of the part.
     pub part: u32,
-    /// Row within it.
+    /// Row within the part.
     pub row: u32,
 }
 
 /// `[P, B, ·]` tensors on the device, without autodiff. The rows of part 0 (the target) come first.
 #[derive(Clone, Debug)]
 pub struct Minibatch {
-    /// s, `[P, B, inputs]`, as the networks see it.
+    /// s, `[P, B, inputs]`, as network inputs.
     pub s: Tensor<3>,
     /// a, `[P, B, act_dim]`.
     pub a: Tensor<3>,
@@ -70,15 +70,15 @@ pub struct Minibatch {
     pub s2: Tensor<3>,
     /// 1 - terminal, `[P, B, 1]`.
     pub not_done: Tensor<3>,
-    /// So many rows at the beginning of every member's batch come from the target.
+    /// Number of rows at the beginning of every member's batch that come from the target.
     pub target_rows: usize,
-    /// Where the rows came from, `[P · B]`.
+    /// The origin of the rows, `[P · B]`.
     pub picks: Vec<Pick>,
 }
 
 impl Minibatch {
-    /// The rows `rows[m]` of every member m, in that order: a batch of what a filter leaves. Give target rows first, as the
-    /// batch has them; ascending indices do.
+    /// The rows `rows[m]` of every member m, in that order: a batch after filtering. Target rows must come first, as in
+    /// the batch; ascending indices ensure this.
     ///
     /// # Panics
     /// If there is not one list per member, the lists are empty or differ in length, or an index is out of range.
@@ -157,19 +157,19 @@ impl Buffer {
                 return Err(LearnError::invalid("batch", batch, expected, "enlarge the batch"));
             }
         }
-        // A dimension that is constant in the data of every member only costs time (Ant's 84 contact slots).
+        // A dimension that is constant in the data of every member would only cost time (Ant's 84 contact slots).
         let live = |d: &usize| members.iter().any(|m| !m.standardizer.dead.contains(d));
         let inputs = (0..dims.0).filter(live).collect();
         Ok(Self { members, batch, inputs, act_dim: dims.1, stream: "batch" })
     }
 
-    /// The same with batches from another stream: two learners of one seed must not draw the same rows at every step.
+    /// The same with batches from another stream: two learners with one seed must not draw the same rows at every step.
     pub fn with_stream(self, stream: &'static str) -> Self {
         Self { stream, ..self }
     }
 
-    /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent that acts. Observations
-    /// reach the networks as they are, without the dimensions `dead`. Draw from it once it has `batch` rows or more.
+    /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent. Observations
+    /// are not standardised; the dimensions `dead` are left out. Sample once it has `batch` rows or more.
     pub fn replay(streams: Streams, dims: (usize, usize), dead: Vec<usize>, batch: usize) -> Self {
         let standardizer = Standardizer { dead, ..Standardizer::identity(dims.0) };
         let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
@@ -191,12 +191,12 @@ impl Buffer {
         &self.members
     }
 
-    /// Their random streams, as the networks' constructors take them.
+    /// The members' random streams, for the constructors of networks.
     pub fn streams(&self) -> Vec<Streams> {
         self.members.iter().map(|m| m.streams).collect()
     }
 
-    /// The observation dimensions the networks see, ascending: all but those dead for every member.
+    /// The observation dimensions that the networks see, ascending: all except those that are dead for every member.
     pub fn inputs(&self) -> &[usize] {
         &self.inputs
     }
@@ -216,7 +216,7 @@ impl Buffer {
         self.batch
     }
 
-    /// The same members with the target part only, and another batch size.
+    /// The same members with only the target part, and another batch size.
     pub fn target_only(&self, batch: usize) -> Result<Self, LearnError> {
         let only = |m: &Member| Member { parts: m.parts[..1].to_vec(), row_scores: None, ..m.clone() };
         Ok(Self { inputs: self.inputs.clone(), ..Self::new(self.members.iter().map(only).collect(), batch)? })
@@ -256,8 +256,8 @@ impl Buffer {
         }
     }
 
-    /// The actions of the rows that come next `[P, B, d_a]`, and 1 where the data tell it, else 0, `[P, B, 1]`: within an
-    /// episode, if the next row begins where this one ends. Generated rows have no next one.
+    /// The actions of the next rows `[P, B, d_a]`, and 1 if the data contain them, else 0, `[P, B, 1]`. The next row
+    /// must belong to the same episode and start where this row ends. Generated rows have no next row.
     pub fn next_actions(&self, batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
         let [p, b, a] = batch.a.dims();
         let (mut actions, mut known) = (vec![0.0; p * b * a], vec![0.0; p * b]);
@@ -273,7 +273,7 @@ impl Buffer {
         (tensor(actions, [p, b, a], &device), tensor(known, [p, b, 1], &device))
     }
 
-    /// Observations of member `member` as its networks see them: the inputs, standardised, row-major.
+    /// Observations of member `member` as network inputs: the visible dimensions, standardised, row-major.
     pub fn network_inputs(&self, member: usize, observations: &[f32]) -> Vec<f32> {
         let mut out = Vec::with_capacity(observations.len() / self.obs_dim() * self.inputs.len());
         for row in observations.chunks_exact(self.obs_dim()) {
@@ -291,14 +291,14 @@ impl Buffer {
         Standardizer::fit(&steps, self.inputs.len())
     }
 
-    /// Appends an observation of `member` as its networks see it.
+    /// Appends an observation of `member` as network inputs.
     pub(crate) fn push(&self, member: &Member, row: &[f32], out: &mut Vec<f32>) {
         let z = &member.standardizer;
         out.extend(self.inputs.iter().map(|&d| (row[d] - z.mean[d]) / z.std[d]));
     }
 }
 
-/// `batch` rows over the parts that have any, evenly; what is left over goes to the earlier parts.
+/// Splits `batch` rows evenly over the parts that have rows; the remainder goes to the earlier parts.
 pub(crate) fn split(batch: usize, parts: &[Arc<Transitions>]) -> Vec<usize> {
     let live = parts.iter().filter(|p| !p.is_empty()).count();
     let mut given = 0;
@@ -325,8 +325,8 @@ pub enum RewardScale {
 
 /// 1000 / (max - min) of the returns of all trajectories of `tables`.
 ///
-/// Give data sets with real trajectories: the target's and the source's, not generated rows, whose every row is a
-/// trajectory. IQL's authors took the whole data set that the learner sees.
+/// Pass data sets with real trajectories: the target's and the source's. Do not pass generated rows, in which every row
+/// is a trajectory. IQL's authors used the whole data set that the learner sees.
 ///
 /// # Errors
 /// If all trajectories have the same return, or there are fewer than two.
@@ -345,10 +345,10 @@ pub fn return_range_scale(tables: &[&Transitions]) -> Result<f32, LearnError> {
     ))
 }
 
-/// The best trajectories by return: the smallest number of them, at least one, that is `top` of their number or more.
+/// The best trajectories by return: the smallest number of them, at least one, that is at least the share `top` of all.
 ///
-/// A trajectory that the table's end cuts is ranked by the rewards it has: where rewards are positive it may be left out
-/// although it was going to be good, but it is never kept on a guess. Ties go to the earlier one.
+/// A trajectory that is cut at the table's end is ranked by the sum of its existing rewards. If rewards are positive,
+/// it may be left out although it would have become good, but it is never kept on a guess. Ties go to the earlier one.
 ///
 /// # Errors
 /// If `top` is not in (0, 1] or there are no rows.
@@ -430,7 +430,7 @@ mod tests {
         let batch = buffer.sample(0, &cpu());
         let (actions, known) = buffer.next_actions(&batch);
         for ((pick, a), known) in batch.picks.iter().zip(host(actions)).zip(host(known)) {
-            // Rows 1 and 4 end their episodes, row 5 the table.
+            // Rows 1 and 4 end their episodes, row 5 ends the table.
             let expected = if [1, 4, 5].contains(&pick.row) { (0.0, 0.0) } else { (-(pick.row as f32) - 1.0, 1.0) };
             assert_eq!((a, known), expected, "row {}", pick.row);
         }

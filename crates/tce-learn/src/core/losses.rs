@@ -1,4 +1,4 @@
-//! The loss functions, on given values: tensors are `[P, B, D]`, losses `[P, 1, 1]` (one per member).
+//! The loss functions. Tensors are `[P, B, D]`, losses `[P, 1, 1]` (one per member).
 //!
 //! | function | formula | source |
 //! |---|---|---|
@@ -17,7 +17,7 @@ pub fn member_mean(x: Tensor<3>) -> Tensor<3> {
     x.mean_dim(2).mean_dim(1)
 }
 
-/// Asymmetric squares of u = Q - V `[P, B, 1]`: weight τ where u ≥ 0, 1 - τ where u < 0.
+/// Asymmetric squares of u = Q - V `[P, B, 1]`: weight τ if u ≥ 0, 1 - τ if u < 0.
 pub fn expectile_loss(u: Tensor<3>, tau: f64) -> Tensor<3> {
     let below = u.clone().inner().lower_elem(0.0).float();
     let weight = below * (1.0 - 2.0 * tau) + tau;
@@ -36,12 +36,12 @@ pub enum AdvantageScale {
     Standardised,
 }
 
-/// Which weights a policy may give to rows.
+/// Settings of [`advantage_weights`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdvantageWeights {
     /// β
     pub temperature: f64,
-    /// Greatest weight.
+    /// Largest weight.
     pub cap: f64,
     /// Units of u.
     pub scale: AdvantageScale,
@@ -88,7 +88,7 @@ pub fn squared_td_error(q: Tensor<3>, y: Tensor<3>, weights: Option<Tensor<3>>) 
 
 /// Binary cross-entropy of logits `[P, B, 1]` against labels in [0, 1], mean over rows: ln(1 + e^x) - label x.
 pub fn binary_cross_entropy(logits: Tensor<3>, labels: Tensor<3>) -> Tensor<3> {
-    // ln(1 + e^x) = max(x, 0) + ln(1 + e^-|x|): no exponential overflows.
+    // ln(1 + e^x) = max(x, 0) + ln(1 + e^-|x|): the exponential cannot overflow.
     let softplus = logits.clone().clamp_min(0.0) + (-logits.clone().abs()).exp().log1p();
     member_mean(softplus - logits * labels)
 }

@@ -1,4 +1,4 @@
-//! What every training stands on: rows and batches, the one training loop, losses.
+//! The basis of every training run: rows and batches, the training loop, losses.
 
 pub(crate) mod blocks;
 pub(crate) mod buffer;

@@ -1,4 +1,4 @@
-//! As coded, or as meant.
+//! Two forms of a method: as in the public code, or as in the paper.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,18 +1,19 @@
-//! Segments of trajectories: what a model with a memory learns from.
+//! Segments of trajectories: the training data of models with a memory.
 //!
-//! A segment is the K steps that end at a row drawn from a member's tables, cut where its episode begins: what a policy has before
-//! it when it acts. Half of the rows come from the target, half from the source, as in a [`Buffer`]; member m draws those of step
-//! t from its stream `segments`, index t.
+//! A segment consists of the K steps that end at a row drawn from a member's tables, cut at the start of the episode.
+//! This is what a policy knows when it acts. Half of the rows come from the target, half from the source, as in a
+//! [`Buffer`]. Member m draws the rows of step t from its stream `segments`, index t.
 //!
 //! | symbol | shape | meaning |
 //! |---|---|---|
-//! | s, a, r, s' | `[B, K, ·]` | the steps of a segment, the first of them at 0; behind the last one, zeros |
-//! | R̂ | `[B, K, 1]` | return to go: the sum of the rewards from a step to the end of its episode, its own included |
+//! | s, a, r, s' | `[B, K, ·]` | the steps of a segment, starting at index 0; zeros after the last one |
+//! | R̂ | `[B, K, 1]` | return to go: the sum of the rewards from a step (included) to the end of its episode |
 //! | t | `[B, K]` | steps since the beginning of the episode |
-//! | strip | `[B, h + K - 1, ·]` | (s, a, r) of the h steps before the segment and of the segment: steps k..k + h of the strip are the h steps before step k of the segment; before the episode's beginning, zeros |
+//! | strip | `[B, h + K - 1, ·]` | (s, a, r) of the h steps before the segment, then of the segment; zeros before the episode |
 //!
-//! An episode that was cut has a return to go of the rewards that are there. A table without an order of time (generated rows:
-//! every row its own episode) gives segments of one step.
+//! Steps k..k + h of the strip are the h steps before step k of the segment. The return to go of a cut episode is the
+//! sum of the rewards that it has. A table without an order of time (generated rows: every row is its own episode)
+//! gives segments of one step.
 
 use std::sync::Arc;
 
@@ -21,7 +22,7 @@ use tce_data::Transitions;
 
 use crate::buffer::{Buffer, Member, Pick, split};
 
-/// Where the episodes of a member's tables begin, and what is to be had from each row on.
+/// The starts of the episodes of a member's tables, and the return to go of each row.
 #[derive(Clone, Debug)]
 pub struct Trajectories {
     tables: Vec<Table>,
@@ -40,42 +41,42 @@ struct Table {
 /// Segments of one member; the arrays of the [module](self), row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Segments {
-    /// s as the networks see it.
+    /// s as network inputs.
     pub states: Vec<f32>,
     /// a
     pub actions: Vec<f32>,
     /// r
     pub rewards: Vec<f32>,
-    /// s' as the networks see it.
+    /// s' as network inputs.
     pub next_states: Vec<f32>,
     /// R̂
     pub returns_to_go: Vec<f32>,
     /// t
     pub times: Vec<i32>,
-    /// 1 where there is a step, 0 behind the last one, `[B, K, 1]`.
+    /// 1 for steps of the segment, 0 after the last one, `[B, K, 1]`.
     pub valid: Vec<f32>,
-    /// s of the strip, as the networks see it.
+    /// s of the strip, as network inputs.
     pub strip_states: Vec<f32>,
     /// a of the strip.
     pub strip_actions: Vec<f32>,
     /// r of the strip.
     pub strip_rewards: Vec<f32>,
-    /// The rows the segments end at, `[B]`.
+    /// The rows at which the segments end, `[B]`.
     pub picks: Vec<Pick>,
 }
 
 impl Trajectories {
-    /// Those of `member`.
+    /// The trajectories of `member`.
     pub fn new(member: &Member) -> Self {
         Self { tables: member.parts.iter().map(|rows| Table::new(rows.clone())).collect() }
     }
 
-    /// The greatest return of a trajectory of the target.
+    /// The largest return of a trajectory of the target.
     pub fn best_target_return(&self) -> f64 {
         self.tables.first().map_or(0.0, |t| t.best_return)
     }
 
-    /// Rows of each table.
+    /// Number of rows of each table.
     pub(crate) fn rows(&self) -> impl Iterator<Item = usize> {
         self.tables.iter().map(|t| t.rows.len())
     }
@@ -94,10 +95,10 @@ impl Trajectories {
         out
     }
 
-    /// The `batch` segments of `step`, each of up to `context` steps, with strips for `horizon` steps of history (none: no
+    /// The `batch` segments of `step`, each of up to `context` steps, with strips for `horizon` steps of history (0: no
     /// strips).
     ///
-    /// `member` is the number in `buffer` of the member whose trajectories these are.
+    /// `member` is the index in `buffer` of the member with these trajectories.
     pub fn sample(&self, buffer: &Buffer, member: usize, step: u64, [batch, context, horizon]: [usize; 3]) -> Segments {
         let of = &buffer.members()[member];
         let mut rng = of.streams.indexed("segments", step);
@@ -136,7 +137,7 @@ impl Table {
         let (d, a) = (buffer.inputs().len(), buffer.act_dim());
         let member = &buffer.members()[member];
         for i in start..start + context {
-            // Behind the drawn row the segment is over, even where the episode goes on.
+            // The segment ends at the drawn row, even if the episode continues.
             let valid = i <= row;
             out.valid.push(f32::from(u8::from(valid)));
             if valid {
@@ -156,7 +157,7 @@ impl Table {
             }
         }
         for k in 0..if horizon > 0 { horizon + context - 1 } else { 0 } {
-            // Step start - horizon + k; the drawn row itself is nobody's history.
+            // Step start - horizon + k; the drawn row itself is not part of any history.
             match (start + k).checked_sub(horizon).filter(|i| (first..row).contains(i)) {
                 Some(i) => {
                     buffer.push(member, t.observation(i), &mut out.strip_states);
@@ -219,7 +220,7 @@ mod tests {
         [0..5, 5..6, 6..20].into_iter().find(|e| e.contains(&row)).unwrap()
     }
 
-    /// Every entry against what the row numbers say, by brute force.
+    /// Checks every entry against the row numbers, by brute force.
     #[test]
     fn segments_end_at_their_row_and_never_cross_an_episode() {
         let s = sample(3, 7);
@@ -243,7 +244,7 @@ mod tests {
                 };
                 assert_eq!([s.states[at], s.actions[at], s.rewards[at]], x);
                 assert_eq!((s.valid[at], s.returns_to_go[at], s.times[at]), (1.0, to_go, (i - begin) as i32));
-                // The H steps before step i, the nearest last.
+                // The H steps before step i; the last one is the nearest.
                 for j in 0..H {
                     let at = b * (H + K - 1) + k + j;
                     let expected = match (i + j).checked_sub(H).filter(|n| *n >= begin) {

@@ -1,4 +1,4 @@
-//! One training loop for everything that learns, and what every learner is made of.
+//! The training loop that all learners share, and the interface of a learner.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,31 +12,31 @@ use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, o
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::LearnError;
 
-/// Metrics are computed every so many steps: more would cost time and not change their means. A prime, because what a
-/// method does at every second step is to be seen too.
+/// Metrics are computed every so many steps. More would cost time without changing their means. The number is a prime,
+/// so that events of every second step are also included.
 const METER_EVERY: u64 = 11;
-/// Steps of a job before the next one's turn.
+/// Steps of a job before the next job gets its turn.
 const TURN: u64 = 50;
 
-/// Where a training keeps its checkpoints, and what tells it from others.
+/// Where a training run stores its checkpoints, and what distinguishes it from others.
 #[derive(Clone, Copy, Debug)]
 pub struct Place<'a> {
-    /// The directory; none keeps nothing, for trainings of seconds and tests.
+    /// The directory; `None` stores nothing, for short runs and tests.
     pub directory: Option<&'a Path>,
-    /// Cache key: hash of all that decides the result.
+    /// Cache key: hash of all inputs that affect the result.
     pub key: &'a str,
-    /// Which of several trainings side by side.
+    /// The index of the job among several parallel ones.
     pub job: usize,
-    /// Takes the metrics of what is trained before the first step.
+    /// Receives the metrics of preparations (training before the first step).
     pub journal: Option<&'a Journal>,
 }
 
-/// The metrics of preparations, from jobs that may run side by side.
+/// The metrics of preparations, from jobs that may run in parallel.
 #[derive(Debug, Default)]
 pub struct Journal(Mutex<Vec<(usize, String, Report)>>);
 
 impl Journal {
-    /// Job, training and report, in the order of jobs and steps, whatever the order in which they came.
+    /// Job, training and report, sorted by jobs and steps, independent of the order in which they arrived.
     ///
     /// # Panics
     /// If a job has panicked.
@@ -47,19 +47,19 @@ impl Journal {
     }
 }
 
-/// How the checkpoints of [`prepare`] begin.
+/// Prefix of the checkpoint names of [`prepare`].
 const PREPARATION: &str = "prepare";
-/// Reports of a preparation.
+/// Number of reports of a preparation.
 const PREPARATION_REPORTS: u64 = 10;
 
 impl Place<'_> {
-    /// Nothing is kept.
+    /// Nothing is stored.
     pub const NONE: Place<'static> = Place { directory: None, key: "", job: 0, journal: None };
 
-    /// The checkpoints of the training `name` here.
+    /// The checkpoints of the training run `name` at this place.
     ///
     /// # Errors
-    /// If there are some that cannot be read.
+    /// If existing checkpoints cannot be read.
     pub fn checkpoints(&self, name: &str) -> Result<Checkpoints, LearnError> {
         Ok(match self.directory {
             Some(directory) => Checkpoints::open(directory, name, self.key)?,
@@ -67,7 +67,7 @@ impl Place<'_> {
         })
     }
 
-    /// Removes what [`prepare`] kept, for all jobs: the result is on disk.
+    /// Removes the checkpoints of [`prepare`], for all jobs. Call it when the result is on disk.
     pub fn discard_preparations(&self) {
         let entries = self.directory.and_then(|d| std::fs::read_dir(d).ok());
         for entry in entries.into_iter().flatten().flatten() {
@@ -80,8 +80,8 @@ impl Place<'_> {
     }
 }
 
-/// Trains what a learner needs before its first step: `steps` steps on `buffer`, resumed from the checkpoints at `place`, where
-/// the end is kept too. Its metrics go to the journal of `place`. False if the user interrupted it.
+/// Trains a model that a learner needs before its first step: `steps` steps on `buffer`, resumed from the checkpoints
+/// at `place`. The end is stored, too. Metrics go to the journal of `place`. False if the user interrupted it.
 ///
 /// # Errors
 /// If a checkpoint cannot be read or written.
@@ -113,17 +113,17 @@ pub trait Learner: Send {
     /// One step. `step` counts from 0; metrics go to `meter`.
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter);
 
-    /// All parameters and optimiser states: what [`Learner::restore`] needs to go on as if nothing had happened.
+    /// All parameters and optimiser states: all that [`Learner::restore`] needs to resume exactly.
     fn state(&self) -> NamedParameters;
 
-    /// Puts back a [`Learner::state`]; `path` is where it came from, for messages.
+    /// Restores a [`Learner::state`]; `path` is its file, for messages.
     ///
     /// # Errors
     /// If it belongs to another learner.
     fn restore(&mut self, state: &NamedParameters, path: &Path) -> Result<(), NetworkError>;
 }
 
-/// Draws of N(0, 1) `[P, rows, width]`, member m's from stream `index` of `name` of its own.
+/// Draws of N(0, 1) `[P, rows, width]`; member m's are from its own stream `name`, index `index`.
 pub fn member_noise(members: &[Streams], name: &str, index: u64, shape: [usize; 3], device: &Device) -> Tensor<3> {
     let mut noise = vec![0.0; shape.iter().product()];
     for (noise, streams) in noise.chunks_mut(shape[1] * shape[2]).zip(members) {
@@ -141,7 +141,7 @@ pub struct Meter {
     sums: BTreeMap<String, (Vec<f64>, u64)>,
 }
 
-/// Sums as the bits of the numbers: JSON has no NaN, and a member that has diverged has nothing else.
+/// Serialises sums as the bits of the numbers: JSON has no NaN, and a member that has diverged has only NaN.
 mod bits {
     use std::collections::BTreeMap;
 
@@ -163,22 +163,22 @@ mod bits {
 }
 
 impl Meter {
-    /// A meter that takes every metric.
+    /// A meter that records every metric.
     pub fn always() -> Self {
         Self { active: true, ..Self::default() }
     }
 
-    /// Whether metrics are wanted at this step; learners ask before they compute any.
+    /// Whether metrics are recorded at this step. Learners check this before they compute any.
     pub fn active(&self) -> bool {
         self.active
     }
 
-    /// An empty meter that is as active, for work on another thread; [`Meter::join`] takes its metrics back.
+    /// An empty meter with the same activity, for work on another thread; [`Meter::join`] adds its metrics to this one.
     pub fn fork(&self) -> Self {
         Self { active: self.active, ..Self::default() }
     }
 
-    /// Takes the metrics of a [`Meter::fork`].
+    /// Adds the metrics of a [`Meter::fork`].
     pub fn join(&mut self, fork: Self) {
         for (name, (values, count)) in fork.sums {
             let (sum, n) = self.sums.entry(name).or_insert_with(|| (vec![0.0; values.len()], 0));
@@ -187,7 +187,7 @@ impl Meter {
         }
     }
 
-    /// Takes the mean over each member's entries of `value` `[P, ·, ·]`.
+    /// Records the mean over each member's entries of `value` `[P, ·, ·]`.
     pub fn record(&mut self, name: &str, value: &Tensor<3>) {
         if self.active {
             let members = value.dims()[0];
@@ -198,21 +198,21 @@ impl Meter {
         }
     }
 
-    /// Takes one metric per member.
+    /// Records one metric per member.
     pub fn add(&mut self, name: &str, per_member: Vec<f64>) {
         let (sum, count) = self.sums.entry(name.to_owned()).or_insert_with(|| (vec![0.0; per_member.len()], 0));
         sum.iter_mut().zip(per_member).for_each(|(s, v)| *s += v);
         *count += 1;
     }
 
-    /// The means since the last call, and starts anew.
+    /// Returns the means since the last call and resets the meter.
     pub fn take(&mut self) -> BTreeMap<String, Vec<f64>> {
         let means = |(sum, n): (Vec<f64>, u64)| sum.into_iter().map(|s| s / n as f64).collect();
         std::mem::take(&mut self.sums).into_iter().map(|(name, entry)| (name, means(entry))).collect()
     }
 }
 
-/// What [`train`] tells now and then.
+/// A report that [`train`] gives at intervals.
 #[derive(Clone, Debug)]
 pub struct Report {
     /// Steps done.
@@ -228,7 +228,7 @@ impl From<(u64, Meter)> for Report {
 }
 
 impl Report {
-    /// Members with a metric that is not a finite number: their training has diverged. The others do not feel it.
+    /// Members with a metric that is not finite: their training has diverged. The other members are not affected.
     pub fn diverged(&self) -> Vec<usize> {
         let members = self.metrics.values().map(Vec::len).max().unwrap_or(0);
         let bad = |m: &usize| self.metrics.values().any(|v| v.get(*m).is_some_and(|x| !x.is_finite()));
@@ -236,34 +236,34 @@ impl Report {
     }
 }
 
-/// How many steps, and how often to tell.
+/// The number of steps, and the interval of reports.
 #[derive(Clone, Copy, Debug)]
 pub struct Steps {
     /// First step, 0 unless resumed.
     pub from: u64,
     /// One past the last.
     pub to: u64,
-    /// A report every so many steps, and at the end; 0 for the end only.
+    /// Steps between reports; there is always one at the end; 0: only at the end.
     pub report_every: u64,
 }
 
 impl Steps {
-    /// `count` steps from the beginning.
+    /// `count` steps, starting at 0.
     pub fn new(count: u64, report_every: u64) -> Self {
         Self { from: 0, to: count, report_every }
     }
 }
 
-/// How a training ended: the step it stands at, and whether the user stopped it before its time.
+/// How a training run ended: its current step, and whether the user stopped it early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Outcome {
-    /// Steps done; where to resume from.
+    /// Steps done; the run can be resumed from here.
     pub step: u64,
-    /// Whether it was interrupted.
+    /// Whether the user interrupted it.
     pub interrupted: bool,
 }
 
-/// A learner and the rows it learns from.
+/// A learner and its rows.
 pub struct TrainingJob<'a, L: ?Sized> {
     /// The learner.
     pub learner: &'a mut L,
@@ -274,7 +274,7 @@ pub struct TrainingJob<'a, L: ?Sized> {
 /// Trains `learner` on minibatches of `buffer`: [`train_side_by_side`] with one job.
 ///
 /// # Errors
-/// That of `on_report`, and those of the checkpoints.
+/// The error of `on_report`, and errors of the checkpoints.
 pub fn train<L: Learner + ?Sized, E: From<LearnError>>(
     learner: &mut L,
     buffer: &Buffer,
@@ -290,17 +290,17 @@ pub fn train<L: Learner + ?Sized, E: From<LearnError>>(
 
 /// Trains the learners of all jobs, with one progress bar named `label`.
 ///
-/// Jobs take the threads in turns of a few steps, so that three jobs keep two cores busy; what a job learns does not
-/// depend on the others, nor on the number of threads. `on_report` gets the job, the means of its metrics and its learner,
-/// to evaluate or save it; its error ends the training. The learners' device is the one of their parameters; batches are
-/// made on `device`, each while the update before it runs.
+/// Jobs take the threads in turns of a few steps, so that three jobs keep two cores busy. The result of a job does not
+/// depend on the other jobs or on the number of threads. `on_report` gets the job, the means of its metrics and its
+/// learner, to evaluate or save it; an error from it ends the training run. The learners' device is that of their
+/// parameters. Batches are created on `device`, each during the update before it.
 ///
-/// With `checkpoints` the training resumes from the newest one, and keeps one at intervals and when the user interrupts: the
-/// result and all reports are then those of an undisturbed training. A training that is done leaves them to the caller, who removes
-/// them once the result is safe.
+/// With `checkpoints`, training resumes from the newest one, and stores one at intervals and when the user interrupts.
+/// The result and all reports are then the same as without interruption. A finished run leaves its checkpoints to the
+/// caller, who removes them once the result is stored.
 ///
 /// # Errors
-/// That of `on_report`; if a checkpoint does not fit the learners or cannot be written.
+/// The error of `on_report`; if a checkpoint does not fit the learners or cannot be written.
 pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     jobs: &mut [TrainingJob<L>],
     steps: Steps,
@@ -312,8 +312,8 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     advance(jobs, steps, label, checkpoints, false, device, on_report)
 }
 
-/// The loop. `keep_end`: the end is kept as a checkpoint too, for a training that is no result of its own. Its reports are in the
-/// checkpoints and are all given at the end, those of an earlier process and of one that had nothing left to do included.
+/// The loop. `keep_end`: also store the end as a checkpoint, for a preparation. Its reports are stored in the
+/// checkpoints and all given at the end, including those of an earlier process and of a run with no steps left.
 fn advance<L: Learner + ?Sized, E: From<LearnError>>(
     jobs: &mut [TrainingJob<L>],
     steps: Steps,
@@ -389,11 +389,11 @@ fn state_of<L: Learner + ?Sized>(runs: &[Run<L>]) -> NamedParameters {
     state
 }
 
-/// A job under way.
+/// A job in progress.
 struct Run<'a, 'b, L: ?Sized> {
     job: &'a mut TrainingJob<'b, L>,
     meter: Meter,
-    /// Metrics that were due and are given at the end, with their steps.
+    /// Metrics of past reports that are given at the end, with their steps.
     history: Vec<(u64, Meter)>,
     /// The batch of the next step.
     next: Option<Minibatch>,
@@ -412,10 +412,10 @@ impl<'a, 'b, L: Learner + ?Sized> Run<'a, 'b, L> {
         state.metadata.insert(format!("{k}/meter"), metrics);
     }
 
-    /// Puts back what [`Run::keep`] added.
+    /// Restores the state that [`Run::keep`] added.
     fn restore(&mut self, k: usize, state: &NamedParameters, path: &Path) -> Result<(), NetworkError> {
         let mut own = state.under(&format!("{k}/"));
-        // Until November 2026 there was no history.
+        // Checkpoints from before November 2026 have no history.
         let metrics = |text: String| {
             serde_json::from_str(&text).ok().or_else(|| Some((serde_json::from_str(&text).ok()?, Vec::new())))
         };

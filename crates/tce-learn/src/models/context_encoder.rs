@@ -1,4 +1,4 @@
-//! The encoder of contexts z, which Meta-DT's world model is trained with ([`crate::world_model`]) and its policy acts by.
+//! The encoder of contexts z. Meta-DT's world model trains it ([`crate::world_model`]), and its policy uses it.
 
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
@@ -12,9 +12,9 @@ use crate::networks::{Start, initialise, linear};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderSizes {
-    /// Observation dimensions that are seen.
+    /// Number of observation dimensions that the networks see.
     pub inputs: usize,
-    /// Action dimensions.
+    /// Number of action dimensions.
     pub actions: usize,
     /// Width of each part of f.
     pub features: usize,
@@ -27,13 +27,13 @@ pub struct EncoderSizes {
 }
 
 impl EncoderSizes {
-    /// Numbers that an encoder of these sizes holds.
+    /// Number of parameters of an encoder of these sizes.
     pub(crate) fn parameters(&self) -> f64 {
         let [d, a, f, g, z] = [self.inputs, self.actions, self.features, self.hidden, self.latent].map(|n| n as f64);
         (d + a + 1.0 + 3.0) * f + 3.0 * (3.0 * f + g + 2.0) * g + (g + 1.0) * z
     }
 
-    /// New networks; `name` tells their random streams from others'.
+    /// New networks; `name` distinguishes their random streams from others.
     pub(crate) fn init(&self, name: &str, streams: Streams, device: &Device) -> ContextEncoder {
         let c = self;
         let encoder = ContextEncoder {
@@ -44,7 +44,7 @@ impl EncoderSizes {
             latent: linear(c.hidden, c.latent, device),
             horizon: c.horizon,
         };
-        // PyTorch's GRU: all weights and biases within one over the root of the hidden width.
+        // As in PyTorch's GRU: all weights and biases are within ± one over the root of the hidden width.
         let bound = 1.0 / (c.hidden as f32).sqrt();
         initialise(encoder, name, streams, |path| match path.starts_with("gru.") {
             true => Start::Uniform(bound),
@@ -53,7 +53,7 @@ impl EncoderSizes {
     }
 }
 
-/// From the steps before to z; see [`crate::world_model`].
+/// Computes z from the previous steps; see [`crate::world_model`].
 #[derive(Module, Debug)]
 pub struct ContextEncoder {
     state: Linear,
@@ -97,7 +97,7 @@ mod tests {
         values
     }
 
-    /// z of the second step of a segment, written out in f64 from the weights.
+    /// Computes z of the second step of a segment in f64 from the weights.
     #[test]
     fn contexts_follow_the_formula_and_see_nothing_of_their_own_step() {
         let encoder = sizes().init("e", Streams::new(4), &cpu());
@@ -146,7 +146,7 @@ mod tests {
         for (z, e) in host(z.clone())[18..24].iter().zip(expected) {
             assert!((*z as f64 - e).abs() < 1e-5, "{z} {e}");
         }
-        // The last step of the strip is the history of the segment's last step alone.
+        // The last step of the strip belongs to the history of the segment's last step only.
         let (mut other, mut rewards) = (s.clone(), r.clone());
         (other[9], rewards[3]) = (9.0, 9.0);
         let (z, changed) = (host(z), host(run(&other, &rewards)));

@@ -1,4 +1,4 @@
-//! Contexts of rows under a finished world model: each is needed again and again, and computed once.
+//! Contexts of rows under a finished world model. Each is needed many times, but computed only once.
 
 use std::collections::BTreeSet;
 
@@ -10,7 +10,7 @@ use crate::context_encoder::ContextEncoder;
 use crate::sequences::{Segments, Trajectories};
 use crate::world_model::strip;
 
-/// Whose rows are meant, and what their contexts come from.
+/// The rows of a member, and what computes their contexts.
 #[derive(Clone, Copy)]
 pub(crate) struct Of<'a> {
     pub trajectories: &'a Trajectories,
@@ -20,10 +20,10 @@ pub(crate) struct Of<'a> {
     pub device: &'a Device,
 }
 
-/// z of the rows of a member's tables, under a world model that does not change any more.
+/// z of the rows of a member's tables, under a world model that no longer changes.
 ///
-/// They are computed when first asked for, in blocks that are always the same, so that a training that was resumed gets the
-/// same bits: a product of matrices may round a row differently among other rows.
+/// They are computed on first use, in fixed blocks, so that a resumed training run gets the same bits: a matrix product
+/// may round a row differently if the other rows differ.
 #[derive(Clone, Debug)]
 pub(crate) struct Contexts {
     latent: usize,
@@ -33,22 +33,22 @@ pub(crate) struct Contexts {
 #[derive(Clone, Debug)]
 struct TableContexts {
     values: Vec<f32>,
-    /// Whether a block has been computed.
+    /// For each block, whether it has been computed.
     known: Vec<bool>,
 }
 
-/// Rows of a block: few, because the segments of a training's first steps touch as many blocks as they have rows.
+/// Rows per block. It is small, because the segments of the first training steps touch one block for almost every row.
 const BLOCK: usize = 64;
 
 impl Contexts {
-    /// None known yet.
+    /// An empty cache.
     pub(crate) fn new(trajectories: &Trajectories, latent: usize) -> Self {
         let table =
             |rows: usize| TableContexts { values: vec![0.0; rows * latent], known: vec![false; rows.div_ceil(BLOCK)] };
         Self { latent, tables: trajectories.rows().map(table).collect() }
     }
 
-    /// z of the steps of `segments`, `[B, K, Z]` row-major; behind the last step zeros.
+    /// z of the steps of `segments`, `[B, K, Z]` row-major; zeros after the last step.
     pub(crate) fn of(
         &mut self,
         segments: &Segments,

@@ -1,4 +1,4 @@
-//! Twin critics with target networks (Fujimoto et al. 2018), as every algorithm here has them.
+//! Twin critics with target networks (Fujimoto et al. 2018), used by every algorithm here.
 //!
 //! | symbol | here |
 //! |---|---|
@@ -6,8 +6,8 @@
 //! | Q' | [`Critic::target`]: Q' ← (1 - ρ) Q' + ρ Q |
 //! | L_Q | Σᵢ mean w (Qᵢ(s, a) - y)² ([`squared_td_error`]) |
 //!
-//! The two share nothing but their input, so that they are two networks, computed side by side where there are two
-//! threads, and not one of twice the population.
+//! The two critics share only their input. They are therefore two networks, computed in parallel on two threads,
+//! instead of one network with twice the population.
 
 use std::path::Path;
 
@@ -16,12 +16,12 @@ use tce_nn::{Averaged, Device, Mlp, MlpConfig, Module, NamedParameters, NetworkE
 
 use crate::losses::squared_td_error;
 
-/// [s, a], what critics are asked about.
+/// [s, a], the input of critics.
 pub fn state_action(s: &Tensor<3>, a: Tensor<3>) -> Tensor<3> {
     Tensor::cat(vec![s.clone(), a], 2)
 }
 
-/// A critic and the network that follows it.
+/// A critic and its target network.
 pub struct Critic {
     name: &'static str,
     online: Trained<Mlp>,
@@ -39,17 +39,17 @@ impl Critic {
         self.online.net().forward(sa)
     }
 
-    /// Q'(s, a), `[P, B, 1]`, no part of autodiff.
+    /// Q'(s, a), `[P, B, 1]`, outside of autodiff.
     pub fn target(&self, sa: Tensor<3>) -> Tensor<3> {
         self.target.net().forward(sa)
     }
 
-    /// Q(s, a) with weights that get no gradient; the action does.
+    /// Q(s, a) with a gradient for the action but not for the weights.
     pub fn frozen(&self, sa: Tensor<3>) -> Tensor<3> {
         self.online.net().valid().forward(sa)
     }
 
-    /// A step down `loss` of Q(s, a), then one of Q' after Q. Returns the loss per member, `[P, 1, 1]`.
+    /// One step of Q on `loss` of Q(s, a), then one step of Q' towards Q. Returns the loss per member, `[P, 1, 1]`.
     fn step(
         &mut self,
         sa: Tensor<3>,
@@ -72,29 +72,29 @@ pub struct Twins {
 
 impl Twins {
     /// New critics on `inputs` observations and `actions`, drawn from the members' streams `critic 1` and `critic 2`.
-    /// `device` is one with autodiff.
+    /// `device` must support autodiff.
     pub fn new(inputs: usize, actions: usize, hidden: &[usize], members: &[Streams], device: &Device) -> Self {
         Self::with(&MlpConfig::relu(inputs + actions, hidden, 1), members, device)
     }
 
-    /// The same with any network.
+    /// The same with any network configuration.
     pub fn with(config: &MlpConfig, members: &[Streams], device: &Device) -> Self {
         Self { pair: ["critic 1", "critic 2"].map(|name| Critic::new(name, config, members, device)) }
     }
 
-    /// min(Q₁', Q₂')(s, a), no part of autodiff.
+    /// min(Q₁', Q₂')(s, a), outside of autodiff.
     pub fn lesser_target(&self, sa: Tensor<3>) -> Tensor<3> {
         let [one, two] = &self.pair;
         let (q1, q2) = rayon::join(|| one.target(sa.clone()), || two.target(sa.clone()));
         q1.min_pair(q2)
     }
 
-    /// A step of both towards y. `w` `[P, B, 1]` multiplies the rows. Returns the sum of the two losses per member.
+    /// One step of both critics towards y; `w` `[P, B, 1]` multiplies rows. Returns the sum of the losses per member.
     pub fn step(&mut self, sa: Tensor<3>, y: Tensor<3>, w: Option<Tensor<3>>, lr: f64, polyak: f64) -> Tensor<3> {
         self.step_down(sa, |q| squared_td_error(q, y.clone(), w.clone()), lr, polyak)
     }
 
-    /// A step of both down `loss` of Q(s, a), per member `[P, 1, 1]`. Returns the sum of the two losses.
+    /// One step of both critics on `loss` of Q(s, a), per member `[P, 1, 1]`. Returns the sum of the two losses.
     pub fn step_down(
         &mut self,
         sa: Tensor<3>,
@@ -116,7 +116,7 @@ impl Twins {
         }
     }
 
-    /// Takes parameters and optimisers from `state`; `path` is where it came from, for messages.
+    /// Restores parameters and optimisers from `state`; `path` is its file, for messages.
     ///
     /// # Errors
     /// If they belong to other critics.

@@ -1,5 +1,5 @@
-//! Conditional variational autoencoders: of π_b(a|s), the policy that collected the data (as in BCQ; TCE, OTDF, DmC, BOSA), and of
-//! the dynamics p(s'|s, a) (BOSA).
+//! Conditional variational autoencoders: of π_b(a|s), the policy that collected the data (as in BCQ; TCE, OTDF, DmC,
+//! BOSA), and of the dynamics p(s'|s, a) (BOSA).
 //!
 //! ```text
 //! behaviour c = s, x = a;  dynamics c = (s, a), x = s'
@@ -55,13 +55,13 @@ pub struct CvaeConfig {
 }
 
 impl CvaeConfig {
-    /// OTDF's, which the paper takes over.
+    /// OTDF's settings, which the paper adopts.
     pub fn paper() -> Self {
         Self { hidden: vec![750, 750], latent_per_action: 2, kl_weight: 0.5, lr: 1e-3, steps: 10_000, batch: 128 }
     }
 }
 
-/// What is modelled, and given what.
+/// The modelled variable and its condition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Modelled {
     /// a given s.
@@ -80,14 +80,14 @@ impl Modelled {
     }
 }
 
-/// How [`Cvae::log_density`] is estimated.
+/// Settings of the estimate in [`Cvae::log_density`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Density {
     /// K
     pub samples: usize,
     /// β
     pub std: f64,
-    /// With the densities of z and - ln K, as the importance-weighted bound has it; OTDF leaves them out.
+    /// Whether to include the densities of z and - ln K, as in the importance-weighted bound; OTDF omits them.
     pub importance: bool,
 }
 
@@ -138,18 +138,18 @@ impl Cvae {
             term = term + prior - normal_log_prob(z, mean, log_std);
         }
         let term = term.reshape([p, b, k]);
-        // The greatest term taken out first, so that no exponential underflows.
+        // The largest term is factored out, so that no exponential underflows.
         let greatest = term.clone().inner().max_dim(2);
         let sum = (term - greatest.clone()).exp().sum_dim(2).log() + greatest;
         if density.importance { sum - (k as f64).ln() } else { sum }
     }
 
-    /// Latent dimensions.
+    /// Number of latent dimensions.
     pub fn latent(&self) -> usize {
         self.encoder.layers.last().map_or(0, |l| l.weight.val().dims()[2] / 2)
     }
 
-    /// `draws` actions for each state: `states[m]` `[N, inputs]` of member m as the networks see them, result
+    /// `draws` actions for each state: `states[m]` `[N, inputs]` of member m as network inputs, result
     /// `[N, draws, d_a]`. Member m's noise comes from its stream `cvae draws`.
     pub fn draw(
         &self,
@@ -178,7 +178,7 @@ pub struct CvaeLearner {
 }
 
 impl CvaeLearner {
-    /// New networks for the members of `buffer`; `name` tells their random streams from those of others.
+    /// New networks for the members of `buffer`; `name` distinguishes their random streams from others.
     ///
     /// # Errors
     /// If a number of the configuration is out of range.
@@ -208,7 +208,7 @@ impl CvaeLearner {
         Ok(Self { net: Trained::new(net), members, config: config.clone(), modelled, name: name.to_owned() })
     }
 
-    /// The model as it is, outside of autodiff.
+    /// The current model, outside of autodiff.
     pub fn model(&self) -> Cvae {
         self.net.net().valid()
     }
@@ -241,10 +241,10 @@ impl Learner for CvaeLearner {
     }
 }
 
-/// Trains a behaviour CVAE on the target rows of `buffer`. None if the user interrupted it.
+/// Trains a behaviour CVAE on the target rows of `buffer`. `None` if the user interrupted it.
 ///
 /// # Errors
-/// If the configuration cannot be used, or a checkpoint not be read or written.
+/// If the configuration cannot be used, or a checkpoint cannot be read or written.
 pub fn train_cvae(
     buffer: &Buffer,
     config: &CvaeConfig,
@@ -286,7 +286,7 @@ mod tests {
         let first = weights.tensors.get_mut("cvae.decoder.layers.0.weight").unwrap();
         assert_eq!(first.0, [1, 4, 8]);
         first.1[2 * 8..].fill(0.0);
-        // And q(z) = N(.5, 1.5²), whatever s and a.
+        // Also q(z) = N(.5, 1.5²), independent of s and a.
         weights.tensors.get_mut("cvae.encoder.layers.1.weight").unwrap().1.fill(0.0);
         weights.tensors.get_mut("cvae.encoder.layers.1.bias").unwrap().1 = vec![0.5, 0.5, 1.5f32.ln(), 1.5f32.ln()];
         let cvae = weights.apply("cvae", cvae, Path::new("test")).unwrap();

@@ -1,5 +1,5 @@
-//! What happens next in either domain: an ensemble f(s, a, y) ≈ (s' - s, r, terminal), trained on the rows of both, with the domain
-//! as an input.
+//! One-step predictions in both domains: an ensemble f(s, a, y) ≈ (s' - s, r, terminal), trained on the rows of both
+//! domains, with the domain as an input.
 //!
 //! ```text
 //! x = [s, a, y]                        y = 0 in the target, 1 in the source
@@ -7,9 +7,10 @@
 //!     + mean over rows of the cross-entropy of f_T(x) and the terminal flag
 //! ```
 //!
-//! Half of every batch is the target's. The source's many rows teach what the domains share, far from the target's few rows, and the
-//! input y what they do not share. That makes a model that is good where no target row is: it tells which generated rows are possible
-//! ([`Dynamics::errors`]), and lets a policy be tried before it moves a robot ([`Dynamics::predict`], step by step).
+//! Half of every batch is target rows. From the source's many rows the model learns what the domains share, also far
+//! from the few target rows; the input y represents the differences. The model is therefore accurate where there are no
+//! target rows. It shows which generated rows are possible ([`Dynamics::errors`]), and can test a policy before it runs
+//! on a robot ([`Dynamics::predict`], step by step).
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -59,12 +60,12 @@ impl Default for DynamicsConfig {
     }
 }
 
-/// Which of the two domains.
+/// One of the two domains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Domain {
-    /// The changed robot's.
+    /// The domain of the changed robot.
     Target,
-    /// The unchanged robot's.
+    /// The domain of the unchanged robot.
     Source,
 }
 
@@ -77,10 +78,10 @@ impl Domain {
     }
 }
 
-/// What one network of the ensemble expects of some rows.
+/// The predictions of one network of the ensemble for some rows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
-    /// s', `[N, obs_dim]`, in the data's units.
+    /// s', `[N, obs_dim]`, in the units of the data.
     pub next_observations: Vec<f32>,
     /// r, `[N]`.
     pub rewards: Vec<f32>,
@@ -93,7 +94,7 @@ pub struct Dynamics {
     config: DynamicsConfig,
     net: Trained<Mlp>,
     buffer: Buffer,
-    /// m_δ, σ_δ, of standardised dimensions.
+    /// m_δ, σ_δ, for standardised dimensions.
     step: Standardizer,
     /// m_r, σ_r
     reward: (f32, f32),
@@ -101,8 +102,8 @@ pub struct Dynamics {
 }
 
 impl Dynamics {
-    /// An untrained ensemble for the rows of the target and, if there are any, of the source. `standardizer` is how networks see
-    /// observations.
+    /// An untrained ensemble for the rows of the target and, if given, of the source. `standardizer` standardises
+    /// observations for the networks.
     ///
     /// # Errors
     /// If a number is out of range, or the tables do not fit each other.
@@ -134,13 +135,13 @@ impl Dynamics {
         Ok(Self { config: config.clone(), net, buffer, step, reward, device: device.clone() })
     }
 
-    /// Networks of the ensemble.
+    /// Number of networks in the ensemble.
     pub fn members(&self) -> usize {
         self.config.members
     }
 
-    /// What every network expects of its own rows: `tables[k]` holds observations `[N, obs_dim]` and actions `[N, act_dim]`, in
-    /// the data's units, for network k. Dimensions that the networks do not see stay as they are.
+    /// The predictions of every network for its own rows: `tables[k]` holds observations `[N, obs_dim]` and actions
+    /// `[N, act_dim]`, in the units of the data, for network k. Dimensions that the networks do not see stay unchanged.
     ///
     /// # Panics
     /// If there is not one table per network.
@@ -173,8 +174,8 @@ impl Dynamics {
         outputs.iter().zip(tables).map(table).collect()
     }
 
-    /// How far the rows are from what the ensemble expects: RMS over the dimensions that the networks see of (f(s, a) - s') / σ_δ,
-    /// the mean over the networks. 1 is an error as large as the spread of a step.
+    /// The distance of rows from the ensemble's predictions: RMS of (f(s, a) - s') / σ_δ over the dimensions that the
+    /// networks see, averaged over the networks. 1 is an error as large as the spread of a step.
     pub fn errors(&self, rows: &Transitions, domain: Domain) -> Vec<f64> {
         let table = (rows.observations.as_slice(), rows.actions.as_slice());
         let predictions = self.predict(&vec![table; self.members()], domain);
@@ -225,7 +226,7 @@ impl Learner for Dynamics {
     }
 }
 
-/// Trains an ensemble from and with `checkpoints`. None if the user interrupted it.
+/// Trains an ensemble, resuming from and storing `checkpoints`. `None` if the user interrupted it.
 ///
 /// # Errors
 /// If a checkpoint cannot be read or written.
@@ -280,7 +281,7 @@ mod tests {
         }
         let edge: (&[f32], &[f32]) = (&[0.95, 7.0], &[0.9]);
         assert!(model.predict(&[edge, edge], Domain::Target).iter().all(|p| p.terminals[0]));
-        // The source's rows are impossible in the target: half of a step of theirs is missing.
+        // The source's rows are impossible in the target: their steps differ by half of a source step.
         let mean = |e: Vec<f64>| e.iter().sum::<f64>() / e.len() as f64;
         let (own, foreign) = (mean(model.errors(&target, Domain::Target)), mean(model.errors(&source, Domain::Target)));
         assert!(own < 0.1 && foreign > 0.6, "{own} {foreign}");

@@ -1,17 +1,17 @@
-//! Fitted Q evaluation: what a policy is worth, from rows of the target alone and without any model of its dynamics.
+//! Fitted Q evaluation: estimates the value of a policy from target rows alone, without a model of the dynamics.
 //!
 //! ```text
 //! L_Q = mean (Q(s, a) - y)²        y = r + γ (1 - terminal) Q'(s', π(s'))        twin critics, y takes the lesser Q'
 //! V   = mean over the episodes' first states of (Q₁ + Q₂)(s₀, π(s₀)) / 2
 //! ```
 //!
-//! The networks learn Q - c, where c is the mean discounted return of the logged episodes ([`discounted_return`]). A value
-//! spreads backwards by one step per pass of Q' after Q, a hundred steps at γ = .99; a critic that begins at 0 is far below the truth
-//! for tens of thousands of updates, and one that begins at c is not.
+//! The networks learn Q - c, where c is the mean discounted return of the logged episodes ([`discounted_return`]). A
+//! value propagates backwards by one step each time Q' follows Q, and γ = .99 needs a hundred steps. A critic that
+//! starts at 0 is therefore far below the true values for tens of thousands of updates; one that starts at c is not.
 //!
-//! Each replicate learns from another draw of the rows: blocks of consecutive rows, drawn with replacement (a moving-block bootstrap).
-//! The spread of V over the replicates is its standard error. It tells how much V depends on which rows happened to be logged. It does not
-//! tell how wrong Q is at actions that no row has.
+//! Each replicate learns from another draw of the rows: blocks of consecutive rows, drawn with replacement (a
+//! moving-block bootstrap). The spread of V over the replicates is its standard error. It measures how much V depends
+//! on which rows happened to be logged. It does not measure the error of Q at actions that are in no row.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -37,7 +37,7 @@ use crate::critic::{Twins, state_action};
 use crate::error::{LearnError, within};
 use crate::training::{Learner, Meter, Steps, TrainingJob, train_side_by_side};
 
-/// Rows of a block of the bootstrap, at most.
+/// Largest number of rows of a bootstrap block.
 const BLOCK: usize = 50;
 
 /// The configuration of [`fitted_q`]; see the [module](self).
@@ -65,10 +65,10 @@ pub struct FittedQConfig {
 }
 
 impl FittedQConfig {
-    /// Refuses numbers out of range.
+    /// Returns an error for numbers out of range.
     ///
     /// # Errors
-    /// Names the field.
+    /// The error names the field.
     pub fn check(&self) -> Result<(), LearnError> {
         within("discount", self.discount, 0.0..=0.9999)?;
         within("polyak", self.polyak, 0.0..=1.0)?;
@@ -77,7 +77,7 @@ impl FittedQConfig {
         within("replicates", self.replicates as f64, 1.0..=1e3)
     }
 
-    /// Whether every value is the usual one.
+    /// Whether every value is the default.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -98,7 +98,7 @@ pub struct PolicyActions {
     pub start: Vec<f32>,
 }
 
-/// What [`fitted_q`] finds for one policy.
+/// The result of [`fitted_q`] for one policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FittedValue {
     /// V of every replicate.
@@ -158,7 +158,7 @@ impl Learner for FittedQ {
     }
 }
 
-/// Rows of a replicate: blocks of consecutive rows until there are as many as before.
+/// Rows of a replicate: blocks of consecutive rows, as many rows in total as the data have.
 fn bootstrap(rows: usize, streams: &Streams, replicate: u64) -> Vec<usize> {
     let block = BLOCK.min(rows);
     let mut rng = streams.indexed("bootstrap", replicate);
@@ -171,10 +171,10 @@ fn bootstrap(rows: usize, streams: &Streams, replicate: u64) -> Vec<usize> {
     drawn
 }
 
-/// Evaluates policies on the transitions `rows`, all side by side. `starts` are rows whose state is the first of an episode. None if the
-/// user interrupted the training.
+/// Evaluates policies on the transitions `rows`, all in parallel. `starts` are rows whose state is the first of an
+/// episode. `None` if the user interrupted the training.
 ///
-/// Every policy sees the same draws of the rows, so that values of two policies can be compared replicate by replicate.
+/// Every policy is evaluated on the same draws of the rows, so that two policies' values can be compared by replicate.
 ///
 /// # Errors
 /// If a number is out of range, the rows cannot be learned from, or a checkpoint cannot be read or written.
@@ -248,7 +248,7 @@ mod tests {
 
     use super::*;
 
-    /// A walk on a line: s' = s + a / 10, r = a (1 where the state does not matter), so that π(s) = c is worth c / (1 - γ).
+    /// A walk on a line: s' = s + a / 10, r = a (1 if the state does not matter); π(s) = c has value c / (1 - γ).
     fn walk() -> Transitions {
         let mut rng = Streams::new(1).stream("walk");
         let mut t = Transitions::new(1, 1);

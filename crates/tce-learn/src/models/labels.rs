@@ -2,10 +2,10 @@
 //!
 //! | question | answer |
 //! |---|---|
-//! | Which data? | the target's rows, less a share held out to measure the error; for terminals the source's rows, too |
-//! | Which networks? | two or three [`PairModel`]s (Table B.1), trained together, one thread each where there are two |
+//! | Which data? | the target's rows, except a held-out share to measure errors; for terminals also the source's rows |
+//! | Which networks? | two or three [`PairModel`]s (Table B.1), trained together, in two threads if available |
 //! | Actions outside the box? | clipped to [-1, 1]; the share of such components is reported (about 6 %) |
-//! | Terminals? | the paper says nothing: [`TerminalHandling`] |
+//! | Terminals? | not in the paper: [`TerminalHandling`] |
 //!
 //! | field | default | source |
 //! |---|---|---|
@@ -55,30 +55,30 @@ impl LabelConfig {
 /// Whether a generated s' is terminal.
 #[derive(Clone, Copy)]
 pub enum TerminalHandling<'a> {
-    /// Never: every generated row bootstraps.
+    /// Never: every generated row is bootstrapped.
     None,
-    /// A known rule on (s, s'), such as the simulator's.
+    /// A known rule on (s, s'), for example the simulator's.
     Rule(&'a (dyn Fn(&[f32], &[f32]) -> bool + Sync)),
-    /// The classifier says so with probability above one half.
+    /// If the classifier's probability is above one half.
     Learned,
 }
 
 /// Root-mean-square errors of one member on the held-out rows, without clipping.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LabelErrors {
-    /// Held-out rows.
+    /// Number of held-out rows.
     pub rows: usize,
-    /// Of the actions, over rows and components.
+    /// Error of the actions, over rows and components.
     pub action_rmse: f64,
     /// Standard deviation of the actions, for comparison.
     pub action_std: f64,
-    /// Share of predicted components outside of [-1, 1].
+    /// Share of predicted components outside [-1, 1].
     pub outside_box: f64,
-    /// Of the rewards.
+    /// Error of the rewards.
     pub reward_rmse: f64,
     /// Standard deviation of the rewards, for comparison.
     pub reward_std: f64,
-    /// Share of rows whose terminal flag the classifier gets wrong, where there is one.
+    /// Share of rows for which the classifier predicts the wrong terminal flag, if there is a classifier.
     pub terminal_error: Option<f64>,
 }
 
@@ -87,27 +87,27 @@ pub struct LabelErrors {
 pub struct Labelled {
     /// Every row is an episode of its own.
     pub transitions: Transitions,
-    /// Share of action components that were outside of [-1, 1] before clipping.
+    /// Share of action components that were outside [-1, 1] before clipping.
     pub outside_box: f64,
 }
 
 /// The trained models of a population.
 pub struct LabelModels {
-    /// Target rows less the held-out ones; holds the standardisation.
+    /// Target rows without the held-out ones; also holds the standardisation.
     buffer: Buffer,
     held_out: Vec<Transitions>,
     action: PairModel,
     reward: PairModel,
     terminal: Option<PairModel>,
-    /// What the classifier learns from, where that is more than the target's rows.
+    /// Rows for the classifier, if it learns from more than the target's rows.
     both: Option<Buffer>,
     device: Device,
 }
 
 impl LabelModels {
     /// Untrained models for the target part of each member. States are standardised by the member's target rows,
-    /// whatever standardiser the member's policy uses. The classifier of terminals learns from all parts, half a batch of each: which
-    /// states end an episode is a rule that both domains share.
+    /// independent of the member's policy. The classifier of terminals learns from all parts, in equal shares of a
+    /// batch: both domains share the rule which states end an episode.
     ///
     /// # Errors
     /// If the configuration or the data cannot be used.
@@ -151,7 +151,7 @@ impl LabelModels {
         })
     }
 
-    /// Errors on the held-out rows, per member; None where no row was held out.
+    /// Errors on the held-out rows, per member; `None` if no row was held out.
     pub fn errors(&self) -> Vec<Option<LabelErrors>> {
         let pairs: Vec<_> =
             self.held_out.iter().map(|t| pairs(&t.observations, &t.next_observations, t.obs_dim)).collect();
@@ -175,8 +175,8 @@ impl LabelModels {
         self.held_out.iter().enumerate().map(error).collect()
     }
 
-    /// Actions that `member` infers from (s, s'), both `[N, obs_dim]` row-major in original units: `[N, act_dim]`, clipped to [-1, 1].
-    /// What is not finite stays so.
+    /// Actions that `member` infers from (s, s'), both `[N, obs_dim]` row-major in original units: `[N, act_dim]`,
+    /// clipped to [-1, 1]. Values that are not finite are not changed.
     ///
     /// # Errors
     /// If there is no such member, or the lengths do not fit.
@@ -252,7 +252,7 @@ impl Learner for LabelModels {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { action, reward, terminal, both, device, .. } = self;
         let own = both.as_ref().map(|buffer| buffer.sample(step, device));
-        // Small batches feed one thread only: the models are trained side by side.
+        // A small batch uses only one thread, so the models are trained in parallel.
         let (action, (reward, terminal)) = rayon::join(
             || action.update(batch, step),
             || {
@@ -284,7 +284,7 @@ impl Learner for LabelModels {
     }
 }
 
-/// Trains the models on the target part of each member, from and with `checkpoints`. None if the user interrupted it.
+/// Trains the models on each member's target part, resuming from and storing `checkpoints`. `None` if interrupted.
 ///
 /// # Errors
 /// If the configuration or the data cannot be used.
@@ -301,7 +301,7 @@ pub fn train_labels(
     Ok((!outcome.interrupted).then_some(models))
 }
 
-/// Rows (s, s').
+/// Rows that hold (s, s').
 fn pairs(s: &[f32], s2: &[f32], dim: usize) -> Vec<f32> {
     Rows::join(&[(s, dim), (s2, dim)]).to_vec()
 }

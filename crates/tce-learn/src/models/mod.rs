@@ -1,5 +1,5 @@
-//! Networks that learners and generators share, and how they are trained: critics, the behaviour CVAE, labels, dynamics, the parts of
-//! Meta-DT.
+//! Networks that learners and generators share, and their training: critics, the behaviour CVAE, labels, dynamics, the
+//! parts of Meta-DT.
 
 pub mod context_encoder;
 pub(crate) mod contexts;

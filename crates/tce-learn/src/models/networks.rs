@@ -1,9 +1,9 @@
-//! What networks of burn's own modules need here.
+//! Helpers for networks made of burn's modules.
 //!
-//! - Initial weights and dropout from named streams: burn draws both from one generator of the whole process, whose numbers
-//!   depend on which thread asks first.
-//! - The fused operations of `tce-nn` on the parameters of burn's modules. The modules' own forward passes are the definition and
-//!   the oracle in tests; an update of a decision transformer takes two and a half times as long with them.
+//! - Initial weights and dropout from named streams. Burn draws both from one generator for the whole process, so its
+//!   numbers depend on the order of the threads.
+//! - The fused operations of `tce-nn` on the parameters of burn's modules. The modules' own forward passes are the
+//!   definition, and the reference in tests. They make a decision transformer's update two and a half times as slow.
 
 use rand::Rng as _;
 use tce_base::random::{fill_normal, fill_uniform};
@@ -17,10 +17,10 @@ use tce_nn::burn::tensor::activation::softmax;
 use tce_nn::burn::tensor::{Tensor, TensorData};
 use tce_nn::{Activation, Device, Module, dense, layer_norm};
 
-/// How one parameter begins.
+/// Initial value of one parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Start {
-    /// As the module's constructor left it: the scale 1 and shift 0 of a normalisation.
+    /// The value from the module's constructor: scale 1 and shift 0 of a normalisation.
     Kept,
     /// 0
     Zero,
@@ -32,7 +32,7 @@ pub(crate) enum Start {
     Linear,
 }
 
-/// `module` with the weights of a member, each drawn from the stream `init/{name}/{path}` as `rule` says of its path.
+/// `module` with the weights of a member. Each is drawn from the stream `init/{name}/{path}` as `rule` returns.
 pub(crate) fn initialise<M: Module>(module: M, name: &str, streams: Streams, rule: impl Fn(&str) -> Start) -> M {
     module.map(&mut Initialiser { path: vec![format!("init/{name}")], streams, rule, fan_in: 1 })
 }
@@ -41,7 +41,7 @@ struct Initialiser<R> {
     path: Vec<String>,
     streams: Streams,
     rule: R,
-    /// Of the last weight; its bias comes next.
+    /// Fan-in of the last weight; its bias comes next.
     fan_in: usize,
 }
 
@@ -82,10 +82,10 @@ impl<R: Fn(&str) -> Start> ModuleMapper for Initialiser<R> {
     }
 }
 
-/// Dropout with masks from a stream of a member.
+/// Dropout with masks from a member's random stream.
 pub(crate) struct Dropout {
     rng: Option<Rng>,
-    /// Of 65536.
+    /// Dropped share, in units of 1/65536.
     dropped: u32,
 }
 
@@ -95,24 +95,24 @@ impl Dropout {
         Self { rng: Some(rng), dropped: (rate * 65536.0).round() as u32 }
     }
 
-    /// That of a network that is not trained: none.
+    /// Dropout of a network that is not trained: none.
     pub(crate) fn none() -> Self {
         Self { rng: None, dropped: 0 }
     }
 
-    /// With the next mask.
+    /// Applies the next mask.
     pub(crate) fn apply<const D: usize>(&mut self, x: Tensor<D>) -> Tensor<D> {
         Self::apply_members(std::slice::from_mut(self), x)
     }
 
-    /// Each member of a population `[P, ...]` with its own next mask. All of them have the same rate.
+    /// Applies to each member of a population `[P, ...]` its own next mask. All members have the same rate.
     pub(crate) fn apply_members<const D: usize>(members: &mut [Self], x: Tensor<D>) -> Tensor<D> {
         let dropped = members.first().filter(|m| m.rng.is_some()).map_or(0, |m| m.dropped);
         if dropped == 0 {
             return x;
         }
         let dims = x.dims();
-        // Two bytes an element: a float each would cost twice the time, which is a tenth of an update.
+        // Two bytes per element: a float each would take twice the time, which is a tenth of an update.
         let mut bytes = vec![0; 2 * dims.iter().product::<usize>()];
         let share = bytes.len() / members.len();
         let rngs = members.iter_mut().filter_map(|m| m.rng.as_mut());
@@ -125,7 +125,7 @@ impl Dropout {
     }
 }
 
-/// act of the layer of `x` `[A, B, I]`: `[A, B, O]`.
+/// Applies the layer and the activation to `x` `[A, B, I]`: `[A, B, O]`.
 pub(crate) fn affine(layer: &Linear, x: Tensor<3>, act: Activation) -> Tensor<3> {
     let ([a, b, i], weight) = (x.dims(), layer.weight.val());
     let o = weight.dims()[1];
@@ -133,19 +133,19 @@ pub(crate) fn affine(layer: &Linear, x: Tensor<3>, act: Activation) -> Tensor<3>
     dense(x.reshape([1, a * b, i]), weight.reshape([1, i, o]), bias, act).reshape([a, b, o])
 }
 
-/// The normalisation of `x` over its last axis.
+/// Normalises `x` over its last axis.
 pub(crate) fn normalise(norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
     let [gamma, beta] = [&norm.gamma, norm.beta.as_ref().expect("every normalisation here has one")];
     layer_norm(x, gamma.val().reshape([1, 1, -1]), beta.val().reshape([1, 1, -1]))
 }
 
-/// The two layers with a ReLU in between.
+/// Applies the two layers with a ReLU between them.
 pub(crate) fn feed_forward(layers: &PositionWiseFeedForward, x: Tensor<3>) -> Tensor<3> {
     affine(&layers.linear_outer, affine(&layers.linear_inner, x, Activation::Relu), Activation::Identity)
 }
 
-/// Attention of `query` `[B, Q, E]` to `keys` `[B, S, E]`, the values' layer included; `mask` `[B, 1, Q, S]` is true where
-/// there is none. `drop` is done to the weights.
+/// Attention of `query` `[B, Q, E]` to `keys` `[B, S, E]`, including the layer of the values. `mask` `[B, 1, Q, S]` is
+/// true where attention is blocked. `drop` is applied to the attention weights.
 pub(crate) fn attention(
     layers: &MultiHeadAttention,
     query: Tensor<3>,
@@ -166,7 +166,7 @@ pub(crate) fn attention(
     affine(&layers.output, seen, Activation::Identity)
 }
 
-/// A layer whose weights are drawn afterwards.
+/// A layer whose weights are drawn later.
 pub(crate) fn linear(input: usize, output: usize, device: &Device) -> Linear {
     LinearConfig::new(input, output).with_initializer(Initializer::Zeros).init(device)
 }
@@ -190,7 +190,7 @@ mod tests {
         assert_eq!(host(Dropout::new(0.0, Streams::new(1).stream("d")).apply(x.clone())), host(x));
     }
 
-    /// Against the forward passes of burn's modules.
+    /// Compares with the forward passes of burn's modules.
     #[test]
     fn fused_passes_follow_the_modules() {
         use tce_nn::burn::nn::activation::ActivationConfig;

@@ -1,5 +1,5 @@
-//! Networks from a state pair (s, s') to what happened between them: the inverse dynamics model, the reward model and a
-//! classifier of terminals (Table B.1).
+//! Networks from a state pair (s, s') to the action, the reward or the terminal flag between them: the inverse dynamics
+//! model, the reward model and a classifier of terminals (Table B.1).
 //!
 //! ```text
 //! x = [(s - m) / σ, (s' - s - m_δ) / σ_δ]      `delta`;  [(s - m) / σ, (s' - m) / σ]      `next`
@@ -74,7 +74,7 @@ pub enum PairTarget {
     Action,
     /// The reward.
     Reward,
-    /// The logit of s' being terminal.
+    /// The logit of the probability that s' is terminal.
     Terminal,
 }
 
@@ -88,7 +88,7 @@ impl PairTarget {
     }
 }
 
-/// Layer normalisation and a SiLU layer, around which the input is carried unchanged.
+/// Layer normalisation and a SiLU layer, with a skip connection around them.
 #[derive(Module, Debug)]
 struct Block {
     norm: LayerNorm,
@@ -104,7 +104,7 @@ struct PairNet {
 }
 
 impl PairNet {
-    /// `keep[k]` `[P, B, 1]` multiplies the branch of block k; none means 1.
+    /// `keep[k]` `[P, B, 1]` multiplies the branch of block k; `None` means 1.
     fn forward(&self, x: Tensor<3>, keep: Option<&[Tensor<3>]>) -> Tensor<3> {
         let mut h = self.input.forward(x);
         for (k, block) in self.blocks.iter().enumerate() {
@@ -124,15 +124,15 @@ pub struct PairModel {
     config: PairConfig,
     net: Trained<PairNet>,
     members: Vec<Streams>,
-    /// Of the standardised states' differences, `[P, 1, inputs]`.
+    /// Mean and spread of the standardised states' differences, `[P, 1, inputs]`.
     delta: (Tensor<3>, Tensor<3>),
-    /// Of the predicted quantity, `[P, 1, 1]`; (0, 1) but for rewards.
+    /// Mean and spread of the predicted quantity, `[P, 1, 1]`; (0, 1) except for rewards.
     units: (Tensor<3>, Tensor<3>),
     steps: u64,
 }
 
 impl PairModel {
-    /// A new model for the members of `buffer`, in the units of their target rows, to be trained for `steps` steps.
+    /// A new model for the members of `buffer`, with units from their target rows, to be trained for `steps` steps.
     ///
     /// # Errors
     /// If a number of the configuration is out of range.
@@ -186,7 +186,7 @@ impl PairModel {
         })
     }
 
-    /// The network's input from standardised states.
+    /// The network's input, computed from standardised states.
     fn input(&self, s: Tensor<3>, s2: Tensor<3>) -> Tensor<3> {
         let second = match self.config.input {
             PairInput::Next => s2,
@@ -203,7 +203,7 @@ impl PairModel {
         let loss = match self.target {
             PairTarget::Action => squared_error(y, batch.a.clone()),
             PairTarget::Reward => squared_error(y, (batch.r.clone() - self.units.0.clone()) / self.units.1.clone()),
-            // -t ln p - (1 - t) ln (1 - p) of the logit y, without overflow.
+            // -t ln p - (1 - t) ln (1 - p) of the logit y, computed without overflow.
             PairTarget::Terminal => {
                 let terminal = batch.not_done.clone().neg() + 1.0;
                 activation::relu(y.clone()) - y.clone() * terminal + y.abs().neg().exp().log1p()
@@ -216,7 +216,7 @@ impl PairModel {
         values
     }
 
-    /// Stochastic depth: per block `[P, rows, 1]`, 0 for the rows whose branch is left out, else 1 / (1 - p_k).
+    /// Stochastic depth: per block `[P, rows, 1]`, 0 for the rows whose branch is dropped, else 1 / (1 - p_k).
     fn path_masks(&self, rows: usize, step: u64, device: &Device) -> Vec<Tensor<3>> {
         let (p, blocks) = (self.members.len(), self.config.blocks);
         let name = format!("{}/drop path", self.target.name());
@@ -233,11 +233,11 @@ impl PairModel {
         (0..blocks).map(mask).collect()
     }
 
-    /// Predictions for pairs that `buffer` standardises: `pairs[m]` `[N, 2 obs_dim]` holds (s, s') in original units,
-    /// the result `[N, outputs]` too. Stochastic depth is off.
+    /// Predictions for pairs that `buffer` standardises. `pairs[m]` `[N, 2 obs_dim]` holds (s, s') in original units;
+    /// the result is `[N, outputs]`, also in original units. Stochastic depth is off.
     pub fn predict(&self, buffer: &Buffer, pairs: &[Vec<f32>], device: &Device) -> Vec<Vec<f32>> {
         let inputs = buffer.inputs().len();
-        // (s, s') laid end to end are two observations.
+        // The concatenation (s, s') is read as two observations.
         let tables: Vec<_> = pairs.iter().enumerate().map(|(m, pairs)| buffer.network_inputs(m, pairs)).collect();
         let net = self.net.net().valid();
         map_rows(&tables, 2 * inputs, device, |_, x| {
@@ -251,7 +251,7 @@ impl PairModel {
         self.net.save(self.target.name(), state);
     }
 
-    /// Takes parameters and optimiser from `state`. The units are those of the buffer the model was made for.
+    /// Restores parameters and optimiser from `state`. The units are those of the buffer for which the model was made.
     ///
     /// # Errors
     /// If they belong to another model.
@@ -320,7 +320,7 @@ mod tests {
             let std = (column.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / 50.0).sqrt();
             assert!(mean.abs() < 1e-4 && (std - 1.0).abs() < 1e-3, "dimension {d}: {mean}, {std}");
         }
-        // The second difference is the constant -0.5: dead up to rounding, and it must not be blown up.
+        // The second difference is the constant -0.5: dead up to rounding, so it must not be amplified.
         assert!(x[..200].iter().skip(3).step_by(4).all(|v| v.abs() < 100.0));
     }
 

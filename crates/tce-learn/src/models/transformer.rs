@@ -1,4 +1,4 @@
-//! The decision transformer (Chen et al. 2021) of Meta-DT, one member's, of burn's modules.
+//! The decision transformer (Chen et al. 2021) of Meta-DT for one member, made of burn's modules.
 //!
 //! ```text
 //! a step's tokens   R̂ W_R,  [s W_f; z] W_s,  a W_a, each with a bias and + the embedding of t
@@ -7,10 +7,11 @@
 //! π = tanh(LN(x) W_π) at the tokens of the states
 //! ```
 //!
-//! Attention is causal: an action comes of what lies before it in the order above. Two short cuts change no output: the action of the
-//! last step is no token, because nothing comes after it, and the last block computes the tokens of the states alone.
+//! Attention is causal: an action depends only on what precedes it in the order above. Two shortcuts do not change the
+//! output: the last action has no token, because nothing follows it, and the last block computes only the tokens of
+//! states.
 //!
-//! Dropout is GPT-2's: of the tokens, of attention weights, and of what a block adds. Its masks come from the member's streams.
+//! Dropout is as in GPT-2: on tokens, attention weights and a block's output. Its masks come from the member's streams.
 
 use tce_base::Streams;
 use tce_nn::burn::nn::activation::ActivationConfig;
@@ -24,16 +25,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::networks::{Dropout, Start, affine, attention, feed_forward, initialise, linear, normalise};
 
-/// Standard deviation of a block's first weights (GPT-2's).
+/// Standard deviation of a block's initial weights (GPT-2's).
 const WEIGHT_STD: f32 = 0.02;
 
 /// The sizes of a [`DecisionTransformer`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransformerSizes {
-    /// Observation dimensions that are seen.
+    /// Number of observation dimensions that the network sees.
     pub inputs: usize,
-    /// Action dimensions.
+    /// Number of action dimensions.
     pub actions: usize,
     /// Width of z.
     pub latent: usize,
@@ -41,16 +42,16 @@ pub struct TransformerSizes {
     pub features: usize,
     /// Width of a token.
     pub embed: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Heads of attention.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Steps of an episode that are told apart; later ones look like the last.
+    /// Steps of an episode that have different embeddings; later steps share the last one.
     pub timesteps: usize,
 }
 
 impl TransformerSizes {
-    /// Numbers that a transformer of these sizes holds.
+    /// Number of parameters of a transformer of these sizes.
     pub(crate) fn parameters(&self) -> f64 {
         let c = [self.inputs, self.actions, self.latent, self.features, self.embed, self.layers, self.timesteps];
         let [d, a, z, f, e, l, t] = c.map(|n| n as f64);
@@ -85,7 +86,7 @@ impl TransformerSizes {
             norm_out: norm(),
             head: linear(e, self.actions, device),
         };
-        // GPT-2: what is added to the residual stream is smaller the more of it there is.
+        // As in GPT-2: contributions to the residual stream are smaller if there are more of them.
         let residual = WEIGHT_STD / (2.0 * self.layers as f32).sqrt();
         initialise(net, "transformer", streams, |path| match path {
             p if p.ends_with("gamma") || p.ends_with("beta") => Start::Kept,
@@ -120,7 +121,7 @@ pub struct DecisionTransformer {
     head: Linear,
 }
 
-/// The steps of segments, `[B, K, ·]`; those of a segment come first, what stands behind them has no influence on them.
+/// The steps of segments, `[B, K, ·]`. The steps of a segment come first; padding after them does not affect them.
 #[derive(Clone, Debug)]
 pub struct TransformerInput {
     /// R̂ / scale, `[B, K, 1]`.
@@ -129,14 +130,14 @@ pub struct TransformerInput {
     pub states: Tensor<3>,
     /// z
     pub contexts: Tensor<3>,
-    /// a; the last step's is not looked at.
+    /// a; the last step's action is ignored.
     pub actions: Tensor<3>,
-    /// t, `[B, K]`, below the number of time steps that are told apart.
+    /// t, `[B, K]`, less than the number of time steps with embeddings.
     pub times: Tensor<2, Int>,
 }
 
 impl DecisionTransformer {
-    /// The action of every step, `[B, K, A]`; with `dropout` as in training.
+    /// The action of every step, `[B, K, A]`; `dropout` is applied in training.
     pub(crate) fn forward(&self, input: TransformerInput, dropout: &mut Dropout) -> Tensor<3> {
         let [batch, k, _] = input.states.dims();
         let time = self.embed_time.forward(input.times);
@@ -210,7 +211,7 @@ mod tests {
         host(net.forward(TransformerInput { returns, states, contexts, actions, times }, &mut Dropout::none()))
     }
 
-    /// π at a step changes with R̂, s and z of that step and with everything before, and with nothing that comes after.
+    /// π at a step changes with R̂, s and z of that step and with all earlier steps, but not with later ones.
     #[test]
     fn an_action_comes_of_what_lies_before_it() {
         let net = sizes().init(Streams::new(1), &cpu());
@@ -219,7 +220,7 @@ mod tests {
         for step in 0..K {
             for (kind, width) in [1, 3, 4, 2].into_iter().enumerate() {
                 let changed = forward(&net, |all| all[kind][step * width] += 3.0);
-                // An action is seen from the next step on.
+                // An action affects the outputs from the next step on.
                 let first = if kind == 3 { step + 1 } else { step };
                 assert_eq!(plain[..2 * first], changed[..2 * first], "kind {kind}, step {step}: looked ahead");
                 assert_eq!(plain[2 * K..], changed[2 * K..], "another segment changed");
@@ -237,7 +238,7 @@ mod tests {
         assert_eq!(weights.tensors.values().map(|t| t.1.len()).sum::<usize>() as f64, sizes().parameters());
     }
 
-    /// Every mask is used, and the same stream gives the same masks.
+    /// Every mask is used, and the same stream gives the same masks again.
     #[test]
     fn training_drops_and_repeats_itself() {
         let net = sizes().init(Streams::new(1), &cpu());

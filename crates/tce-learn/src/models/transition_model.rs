@@ -1,4 +1,4 @@
-//! A transition model P(s'|s, a) = N(μ, diag σ²): what domains are compared by, not what anything is learned from.
+//! A transition model P(s'|s, a) = N(μ, diag σ²). It is used to compare domains; nothing is learned from it.
 //!
 //! ```text
 //! δ = [(s' - m) - (s - m)] / σ_s,   x = (δ - m_δ) / σ_δ      the step, in units of the first member's target rows
@@ -6,7 +6,7 @@
 //! L = mean over rows and dimensions of ½ ((x - μ) / σ)² + ln σ
 //! ```
 //!
-//! All members share the units of x: the divergences between members are those of their densities of s'.
+//! All members share the units of x, so the divergences between members are those of their densities of s'.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -41,7 +41,7 @@ pub struct TransitionConfig {
     pub steps: u64,
     /// Rows per member and step.
     pub batch: usize,
-    /// Learning rate at the beginning.
+    /// Initial learning rate.
     pub lr: f64,
     /// Bounds of ln σ.
     pub log_std: (f64, f64),
@@ -53,7 +53,7 @@ impl Default for TransitionConfig {
     }
 }
 
-/// Densities of the step of some rows, in the models' units: row-major `[N, d]` each, d the live dimensions.
+/// Predicted densities of the steps of some rows, in the models' units: row-major `[N, d]` each, d live dimensions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Densities {
     /// μ
@@ -62,7 +62,7 @@ pub struct Densities {
     pub log_std: Vec<f32>,
 }
 
-/// Transition models of a population, each on the rows of its own member.
+/// Transition models of a population; each is trained on the rows of its own member.
 pub struct TransitionModel {
     config: TransitionConfig,
     net: Trained<Mlp>,
@@ -73,7 +73,7 @@ pub struct TransitionModel {
 }
 
 impl TransitionModel {
-    /// Untrained models of the members' part 0. All members must see observations in the same units.
+    /// Untrained models of the members' part 0. All members must have observations in the same units.
     ///
     /// # Errors
     /// If a number is out of range, or the members' standardisers differ.
@@ -92,12 +92,12 @@ impl TransitionModel {
         Ok(Self { config: config.clone(), net: Trained::new(net), buffer, units, device: device.clone() })
     }
 
-    /// The dimensions of a density: those that the networks see.
+    /// Number of dimensions of a density: those that the networks see.
     pub fn dim(&self) -> usize {
         self.buffer.inputs().len()
     }
 
-    /// (μ, ln σ), `[P, B, d]` each, of what the network gives.
+    /// (μ, ln σ), `[P, B, d]` each, from the network's output.
     fn split(&self, output: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
         let d = output.dims()[2] / 2;
         let (low, high) = self.config.log_std;
@@ -112,8 +112,8 @@ impl TransitionModel {
         (batch.s2.clone() - batch.s.clone() - wide(&self.units.mean)) / wide(&self.units.std)
     }
 
-    /// The members' densities for (s, a), per member: `tables[m]` holds observations `[N, obs_dim]` and actions `[N, act_dim]` in
-    /// original units.
+    /// The members' densities for (s, a): for each member, `tables[m]` holds observations `[N, obs_dim]` and actions
+    /// `[N, act_dim]` in original units.
     pub fn densities(&self, tables: &[(&[f32], &[f32])]) -> Vec<Densities> {
         let (d, a) = (self.buffer.inputs().len(), self.buffer.act_dim());
         let inputs = |(m, (s, actions)): (usize, &(&[f32], &[f32]))| -> Vec<f32> {
@@ -130,8 +130,8 @@ impl TransitionModel {
         rows.iter().map(|rows| Densities { mean: half(rows, 0), log_std: half(rows, d) }).collect()
     }
 
-    /// The means as next observations `[N, obs_dim]` in original units, for the states they belong to; dimensions that the networks
-    /// do not see stay as they are.
+    /// Converts the means to next observations `[N, obs_dim]` in original units, for the given states. Dimensions that
+    /// the networks do not see keep their values.
     pub fn next_observations(&self, states: &[f32], densities: &Densities) -> Vec<f32> {
         let (inputs, width) = (self.buffer.inputs(), self.buffer.obs_dim());
         let scale = &self.buffer.members()[0].standardizer;
@@ -149,7 +149,7 @@ impl Learner for TransitionModel {
     fn update(&mut self, batch: &Minibatch, step: u64, meter: &mut Meter) {
         let sa = state_action(&batch.s, batch.a.clone());
         let (mean, log_std) = self.split(self.net.net().forward(sa));
-        // The data are no part of autodiff.
+        // The data are outside of autodiff.
         let x = Tensor::from_inner(self.step_of(batch));
         let error = (x - mean) / log_std.clone().exp();
         let loss = member_mean(error.square() * 0.5 + log_std);
@@ -168,7 +168,7 @@ impl Learner for TransitionModel {
     }
 }
 
-/// Trains a model for every member, from and with `checkpoints`. None if the user interrupted it.
+/// Trains a model for every member, resuming from and storing `checkpoints`. `None` if the user interrupted it.
 ///
 /// # Errors
 /// If the configuration or the data cannot be used, or a checkpoint cannot be read or written.
@@ -197,7 +197,7 @@ mod tests {
 
     use super::*;
 
-    /// s' = s + gain a + noise, in two dimensions of different size, beside a dead one.
+    /// s' = s + gain a + noise, in two dimensions of different size, and a dead dimension.
     fn world(seed: u64, gain: f32, noise: [f32; 2]) -> Arc<Transitions> {
         let mut rng = Streams::new(seed).stream("world");
         let mut t = Transitions::new(3, 1);
@@ -241,7 +241,7 @@ mod tests {
                 assert_eq!(next[1], 7.0, "a dead dimension stays");
             }
         }
-        // Units of the first world's steps, whose variance is that of 0.1 a and the noise.
+        // The units are the first world's steps, whose variance is that of 0.1 a plus that of the noise.
         let unit = |gain: f32, noise: f32| (gain * gain / 3.0 + noise * noise).sqrt();
         let expected =
             [[0.02 / unit(0.1, 0.02), 4.0 / unit(10.0, 4.0)], [0.04 / unit(0.1, 0.02), 4.0 / unit(10.0, 4.0)]];

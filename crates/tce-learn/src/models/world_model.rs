@@ -1,4 +1,4 @@
-//! The world model of Meta-DT, whose context z tells domains apart by their dynamics and rewards.
+//! The world model of Meta-DT. Its context z distinguishes domains by their dynamics and rewards.
 //!
 //! ```text
 //! f_t  = [relu(W_s s_t); relu(W_a a_t); relu(W_r r_t)]           features of a step, each of three parts 16 wide
@@ -7,7 +7,7 @@
 //! L    = mean (ŝ' - s')² + mean (r̂ - r)²
 //! ```
 //!
-//! z_t is made of what lies before t, so that it is known when a_t is chosen. Steps before an episode's beginning are zeros.
+//! z_t depends only on steps before t, so it is known when a_t is chosen. Steps before an episode's start are zeros.
 
 use std::path::Path;
 
@@ -27,7 +27,7 @@ use crate::training::{Learner, Meter};
 /// Encoder and decoders of one member.
 #[derive(Module, Debug)]
 pub struct WorldModel {
-    /// What gives z.
+    /// Computes z.
     pub encoder: ContextEncoder,
     next_state: Vec<Linear>,
     reward: Vec<Linear>,
@@ -100,10 +100,10 @@ impl Default for WorldModelConfig {
 }
 
 impl WorldModelConfig {
-    /// Refuses numbers out of range.
+    /// Returns an error for numbers out of range.
     ///
     /// # Errors
-    /// Names the field.
+    /// The error names the field.
     pub fn check(&self) -> Result<(), LearnError> {
         within("world_model.lr", self.lr, 0.0..=1.0)?;
         within("world_model.grad_clip", self.grad_clip, f64::MIN_POSITIVE..=1e9)?;
@@ -119,7 +119,7 @@ impl WorldModelConfig {
         self.hidden.iter().try_for_each(|n| within("world_model.hidden", *n as f64, 1.0..=65536.0))
     }
 
-    /// The encoder's sizes for data of so many input and action dimensions.
+    /// The encoder's sizes for these numbers of input and action dimensions.
     pub fn sizes(&self, inputs: usize, actions: usize) -> EncoderSizes {
         EncoderSizes {
             inputs,
@@ -158,7 +158,7 @@ pub struct SegmentTensors {
 }
 
 impl SegmentTensors {
-    /// `segments` of `steps` steps each.
+    /// Converts `segments` of `steps` steps each.
     pub fn new(segments: &Segments, steps: usize, device: &Device) -> Self {
         let batch = segments.rewards.len() / steps;
         let on_device = |v: &[f32]| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device);
@@ -178,7 +178,7 @@ pub fn strip(segments: &Segments, batch: usize, device: &Device) -> [Tensor<3>; 
         .map(|v| tensor(v.to_vec(), [batch, steps, v.len() / (batch * steps)], device))
 }
 
-/// The world models of a population while they are trained; a member's networks are modules of their own.
+/// The world models of a population during training. Each member's networks are separate modules.
 pub struct Worlds {
     config: WorldModelConfig,
     buffer: Buffer,
@@ -199,7 +199,7 @@ impl Worlds {
         Self { config: config.clone(), buffer: buffer.clone(), device: device.clone(), members }
     }
 
-    /// The trajectories of member `m`, and the encoder as it is now.
+    /// The trajectories of member `m`, and the current encoder.
     pub fn member(&self, m: usize) -> (&Trajectories, &ContextEncoder) {
         let (trajectories, model) = &self.members[m];
         (trajectories, &model.net().encoder)
@@ -207,7 +207,7 @@ impl Worlds {
 }
 
 impl Learner for Worlds {
-    /// The rows of `batch` are not looked at: a learner of sequences draws segments of its own.
+    /// Ignores the rows of `batch`: a learner of sequences draws its own segments.
     fn update(&mut self, _batch: &Minibatch, step: u64, meter: &mut Meter) {
         let Self { config: c, buffer, device, members } = self;
         let mut metrics: [Vec<f64>; 2] = Default::default();

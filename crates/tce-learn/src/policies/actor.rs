@@ -1,4 +1,4 @@
-//! The policy while it is trained: imitation of actions, each row with its own weight.
+//! The policy during training: imitation of actions, with one weight per row.
 //!
 //! L_π = mean over rows of w · ℓ(s, a), with ℓ = -log π(a|s) up to constants:
 //!
@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | [`PolicyForm::TanhMean`] | deterministic tanh(μ(s)) | mean over d of (tanh μ_d - a_d)² |
 //! | [`PolicyForm::TanhGaussian`] | tanh(μ + σ(s) n) | the same; σ is learned through a regulariser only (OTDF) |
-//! | [`PolicyForm::Gaussian`] | N(tanh μ(s), σ²), σ free of s | -Σ_d ln N(a_d; tanh μ_d, σ_d²) |
+//! | [`PolicyForm::Gaussian`] | N(tanh μ(s), σ²), σ independent of s | -Σ_d ln N(a_d; tanh μ_d, σ_d²) |
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -113,7 +113,7 @@ pub struct PolicyOutput {
 }
 
 impl PolicyOutput {
-    /// The first `rows` rows.
+    /// The output for the first `rows` rows.
     pub fn first(&self, rows: usize) -> Self {
         let cut = |t: &Tensor<3>| t.clone().narrow(1, 0, rows);
         Self {
@@ -123,7 +123,7 @@ impl PolicyOutput {
         }
     }
 
-    /// A sample tanh(μ + σ n) that gradients flow through; the noise of `step` comes from each member's streams.
+    /// A sample tanh(μ + σ n) with gradients through it; the noise of `step` comes from each member's streams.
     ///
     /// # Panics
     /// If the form is not [`PolicyForm::TanhGaussian`].
@@ -131,18 +131,18 @@ impl PolicyOutput {
         self.draw(members, "policy noise", step).action
     }
 
-    /// A sample ã = tanh(u), u = μ + σ n, and its log density Σ_d ln N(u_d; μ_d, σ_d²) - ln(1 - tanh² u_d), `[P, B, 1]`;
-    /// n from the members' streams `name`, index `step`.
+    /// A sample ã = tanh(u), u = μ + σ n, and its log density Σ_d ln N(u_d; μ_d, σ_d²) - ln(1 - tanh² u_d),
+    /// `[P, B, 1]`. n comes from the members' streams `name`, index `step`.
     ///
     /// # Panics
     /// If the form is not [`PolicyForm::TanhGaussian`].
     pub fn sample_with_log_prob(&self, members: &[Streams], name: &str, step: u64) -> (Tensor<3>, Tensor<3>) {
         let Draw { noise, u, action, log_std } = self.draw(members, name, step);
-        // ln(1 - tanh² u) = 2 (ln 2 - |u| - ln(1 + e^(-2|u|))): no logarithm of a vanishing number.
+        // ln(1 - tanh² u) = 2 (ln 2 - |u| - ln(1 + e^(-2|u|))): avoids the logarithm of a number near zero.
         let magnitude = u.abs();
         let softplus = (magnitude.clone() * -2.0).exp().log1p();
         let squash = ((magnitude + softplus).neg() + std::f64::consts::LN_2) * 2.0;
-        // (u - μ) / σ is the n that was drawn; from u it comes back with rounding errors that a small σ blows up.
+        // (u - μ) / σ equals the drawn n. Computed from u, it would have rounding errors that a small σ amplifies.
         let normal = (noise.powi_scalar(2) * -0.5 - log_std - 0.5 * std::f64::consts::TAU.ln()) - squash;
         (action, normal.sum_dim(2))
     }
@@ -169,7 +169,7 @@ pub struct Actor {
     net: Trained<ActorNet>,
     config: ActorConfig,
     specs: Vec<PolicySpec>,
-    /// Steps over which the learning rate falls.
+    /// Number of steps over which the learning rate decays.
     steps: u64,
 }
 
@@ -182,7 +182,7 @@ impl Actor {
         Self::named("policy", buffer, config, steps, device)
     }
 
-    /// [`Actor::new`] with first weights from the members' streams `name`.
+    /// [`Actor::new`] with initial weights from the members' streams `name`.
     ///
     /// # Errors
     /// As [`Actor::new`].
@@ -197,7 +197,7 @@ impl Actor {
         let (head, output_activation) = match config.form {
             PolicyForm::TanhMean => (Head::Mean, Activation::Tanh),
             PolicyForm::TanhGaussian => (Head::TanhGaussian, Activation::Identity),
-            // Filled in when the policies are taken out.
+            // Filled in when the policies are extracted.
             PolicyForm::Gaussian => (Head::Gaussian { log_std: Vec::new() }, Activation::Tanh),
         };
         let spec = |member: &crate::buffer::Member| PolicySpec {
@@ -220,10 +220,10 @@ impl Actor {
         Ok(Self { net: Trained::new(net), config: config.clone(), specs, steps })
     }
 
-    /// The weights of `policy`, which came from `path`, in place of drawn ones; the optimiser stays new.
+    /// Replaces the initial weights by those of `policy`, which was read from `path`; the optimiser stays new.
     ///
     /// # Errors
-    /// If it is not a network of the same inputs, layers and form, or this is a population of several.
+    /// If it is not a network with the same inputs, layers and form, or this population has several members.
     pub fn begin_with(&mut self, policy: &MlpPolicy, path: &Path) -> Result<(), LearnError> {
         if self.specs.len() != 1 || *policy.spec() != self.specs[0] {
             let (path, field) = (path.to_owned(), "policy".to_owned());
@@ -255,7 +255,7 @@ impl Actor {
         self.head(net, net.mlp.forward_with(s, hidden))
     }
 
-    /// A network that follows the policy, at the policy for now; [`Actor::step_averaged`] moves it.
+    /// A target network of the policy, initialised with its weights; [`Actor::step_averaged`] updates it.
     pub fn follower(&self) -> Averaged<ActorNet> {
         Averaged::new(self.net.net())
     }
@@ -290,7 +290,7 @@ impl Actor {
         member_mean(squared_error(output.mean.clone(), a))
     }
 
-    /// mean over rows of w · ℓ(s, a), per member. `weights` is `[P, B, 1]`; none means 1.
+    /// mean over rows of w · ℓ(s, a), per member. `weights` is `[P, B, 1]`; `None` means 1.
     pub fn imitation_loss(&self, output: &PolicyOutput, a: Tensor<3>, weights: Option<Tensor<3>>) -> Tensor<3> {
         let per_row = match &output.log_std {
             Some(log_std) => -normal_log_prob(a, output.mean.clone(), log_std.clone()),
@@ -326,13 +326,13 @@ impl Actor {
         member_mean(((z.powi_scalar(2) * 0.5 + log_std) * factor).mean_dim(2))
     }
 
-    /// One optimiser step down the sum of the members' losses, at the learning rate of `step`.
+    /// One optimiser step on the sum of the members' losses, with the learning rate of `step`.
     pub fn step(&mut self, loss: Tensor<3>, step: u64) {
         let lr = self.learning_rate(step);
         self.net.step(loss.sum(), lr);
     }
 
-    /// [`Actor::step`], then `follower` a step of `rate` after the policy.
+    /// [`Actor::step`], then one step of `follower` towards the policy with `rate`.
     pub fn step_averaged(&mut self, loss: Tensor<3>, step: u64, follower: &mut Averaged<ActorNet>, rate: f64) {
         let lr = self.learning_rate(step);
         self.net.step_averaged(loss.sum(), lr, follower, rate);
@@ -342,7 +342,7 @@ impl Actor {
         if self.config.cosine { cosine_decay(self.config.lr, step, self.steps) } else { self.config.lr }
     }
 
-    /// The policies as they are.
+    /// The current policies.
     pub fn policies(&self) -> Vec<Policy> {
         let mut specs = self.specs.clone();
         if let Some(log_std) = &self.net.net().log_std {
@@ -359,7 +359,7 @@ impl Actor {
         self.net.save("policy", state);
     }
 
-    /// Takes parameters and optimiser from `state`.
+    /// Restores parameters and optimiser from `state`.
     ///
     /// # Errors
     /// If they belong to another policy.

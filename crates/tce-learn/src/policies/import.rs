@@ -1,4 +1,4 @@
-//! Policies of other programs as plain numpy arrays (`.npz`), under the kinds of the project's collection of actors.
+//! Policies of other programs as plain numpy arrays (`.npz`), of the kinds in the project's collection of actors.
 //!
 //! | `kind` | inputs | hidden | action |
 //! |---|---|---|---|
@@ -28,7 +28,7 @@ const REMEDY: &str = "see the table of kinds in the documentation of tce_learn::
 /// Reads one `.npz` policy.
 ///
 /// # Errors
-/// If the file cannot be read, is of another kind, or lacks an array.
+/// If the file cannot be read, is of an unknown kind, or lacks an array.
 pub fn load_npz(path: &Path) -> Result<MlpPolicy, LearnError> {
     let arrays = Arrays::read(path)?;
     let kind = arrays.text("kind")?;
@@ -178,7 +178,7 @@ impl<'a> Arrays<'a> {
     }
 }
 
-/// The bytes of an array, its header included; a policy has far fewer.
+/// Limit on the bytes of an array, including its header; a policy has far fewer.
 const LARGEST_ARRAY: u64 = 1 << 28;
 
 fn array(entry: impl Read) -> std::io::Result<Array> {

@@ -1,6 +1,6 @@
 //! Policies without a memory: multi-layer perceptrons from observations to actions.
 //!
-//! x = clip((o - mean) / std) over the input dimensions, z = MLP(x), and an action in the box [-1, 1]:
+//! x = clip((o - mean) / std) over the input dimensions, z = MLP(x), then an action in the box [-1, 1]:
 //!
 //! | head | mean action | sampled action (n ~ N(0, I)) | used by |
 //! |---|---|---|---|
@@ -38,7 +38,7 @@ pub enum Head {
     TanhGaussian,
 }
 
-/// Everything about a policy but its weights.
+/// The specification of a policy: everything except its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PolicySpec {
@@ -46,19 +46,19 @@ pub struct PolicySpec {
     pub observations: usize,
     /// Length of an action.
     pub actions: usize,
-    /// The observation dimensions the network sees, ascending.
+    /// The observation dimensions that the network sees, ascending.
     pub inputs: Vec<usize>,
-    /// Of all observation dimensions.
+    /// Covers all observation dimensions.
     pub standardizer: Standardizer,
     /// Bound on the absolute value of a standardised input.
     pub clip: Option<f32>,
     /// Widths of the hidden layers.
     pub hidden: Vec<usize>,
-    /// Of the hidden layers.
+    /// Activation of the hidden layers.
     pub activation: Activation,
-    /// Of the output layer.
+    /// Activation of the output layer.
     pub output_activation: Activation,
-    /// From output to action.
+    /// Converts the output to an action.
     pub head: Head,
 }
 
@@ -105,7 +105,7 @@ pub struct MlpPolicy {
 }
 
 impl MlpPolicy {
-    /// A policy of the given weights, named `{prefix}.layers.{k}.weight` and `.bias`; `path` is where they came from.
+    /// A policy with the given weights, named `{prefix}.layers.{k}.weight` and `.bias`; `path` is for messages.
     ///
     /// # Errors
     /// If the specification contradicts itself or the weights do not fit it.
@@ -120,11 +120,11 @@ impl MlpPolicy {
         Ok(Self { spec, network })
     }
 
-    /// One network whose last layer gives the mean of what the last layers of `policies` give, before the output activation. Its hidden
-    /// layers are as wide as theirs together; between different policies all weights are zero.
+    /// One network whose last layer outputs the mean of the last layers of `policies`, before the output activation.
+    /// Its hidden layers have the sum of their widths; all weights between different policies are zero.
     ///
     /// # Panics
-    /// If there are none, or they differ in more than their weights.
+    /// If `policies` is empty, or they differ in more than their weights.
     pub fn average(policies: &[&Self]) -> Self {
         let (first, count) = (policies[0], policies.len());
         assert!(policies.iter().all(|p| p.spec == first.spec), "policies of one kind");
@@ -141,7 +141,7 @@ impl MlpPolicy {
             };
             let (name, weights) = of("weight");
             let (rows, columns) = (weights[0].0[1], weights[0].0[2]);
-            // The first layer's input and the last layer's output are shared.
+            // The policies share the input of the first layer and the output of the last layer.
             let (down, across) = (if layer == 0 { 0 } else { rows }, if layer == last { 0 } else { columns });
             let (tall, broad) = (rows + down * (count - 1), columns + across * (count - 1));
             let share = if layer == last { 1.0 / count as f32 } else { 1.0 };
@@ -163,15 +163,15 @@ impl MlpPolicy {
         Self::new(spec, &wide, KEY, Path::new("an average")).expect("a network of this specification")
     }
 
-    /// What it is, without the weights.
+    /// The specification.
     pub fn spec(&self) -> &PolicySpec {
         &self.spec
     }
 
-    /// The policy of a file that was read before; `path` is for messages.
+    /// The policy in the parameters of a file; `path` is for messages.
     ///
     /// # Errors
-    /// If it is not a policy.
+    /// If the parameters are not a policy.
     pub fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
         let fault = |found: String| LearnError::Policy {
             path: path.to_owned(),
@@ -185,7 +185,7 @@ impl MlpPolicy {
         Self::new(spec, parameters, KEY, path)
     }
 
-    /// The weights and, in the metadata, the specification.
+    /// The weights, with the specification in the metadata.
     pub fn to_parameters(&self) -> NamedParameters {
         let mut out = NamedParameters::default();
         out.collect(KEY, &self.network);
@@ -194,11 +194,11 @@ impl MlpPolicy {
         out
     }
 
-    /// Fills `actions` `[rows, d_a]` for `observations` `[rows, d_s]`, both row-major: mean actions, or, with one
-    /// generator per row, sampled ones. A row's result depends on that row and its generator only.
+    /// Fills `actions` `[rows, d_a]` for `observations` `[rows, d_s]`, both row-major: with mean actions, or with
+    /// sampled ones if there is one generator per row. The result of a row depends only on that row and its generator.
     ///
     /// # Panics
-    /// If the lengths do not fit each other.
+    /// If the lengths do not match.
     pub fn act(&self, observations: &[f32], rngs: Option<&mut [Rng]>, actions: &mut [f32]) {
         let spec = &self.spec;
         let rows = observations.len() / spec.observations;
@@ -235,7 +235,7 @@ impl MlpPolicy {
     }
 }
 
-/// The policies of a population: member m gets the m-th network of `networks` and the m-th specification.
+/// Splits a population into policies: member m gets the m-th network of `networks` and the m-th specification.
 pub(crate) fn from_population<M: Module>(specs: Vec<PolicySpec>, networks: &M) -> Vec<MlpPolicy> {
     let mut all = NamedParameters::default();
     all.collect(KEY, networks);

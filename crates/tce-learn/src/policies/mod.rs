@@ -1,4 +1,4 @@
-//! Policies: what acts, in files of ours and of others, and the networks that become one.
+//! Policies: how they act, their files (ours and those of other programs), and the networks they are made from.
 
 pub mod actor;
 pub mod import;

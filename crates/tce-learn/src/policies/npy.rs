@@ -1,25 +1,25 @@
-//! Arrays of numpy's files (`.npy`, and the members of `.npz`), as far as policies need them: numbers of f32 and f64, and
-//! texts. Crates that read all of the format bring thirty others along.
+//! Arrays in numpy's files (`.npy`, and the members of `.npz`), limited to what policies need: f32 and f64 numbers, and
+//! text. Crates that support the complete format have thirty dependencies.
 
 use std::io::{Error, ErrorKind, Result};
 
 /// An array: its shape, and its values in C's order.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Array {
-    /// All elements, one after the other.
+    /// All elements, concatenated.
     Text(String),
     /// Shape and values, row-major.
     Numbers(Vec<usize>, Vec<f64>),
 }
 
-/// Texts are names of kinds.
+/// Longest text in characters; texts are only names of kinds.
 const LONGEST_TEXT: usize = 1000;
 
 fn invalid<T>(what: String) -> Result<T> {
     Err(Error::new(ErrorKind::InvalidData, what))
 }
 
-/// The array in the bytes of a `.npy` file. Memory grows with the bytes, whatever a damaged file promises.
+/// The array in the bytes of a `.npy` file. Memory use is limited by these bytes, even if a damaged file declares more.
 pub(crate) fn parse(bytes: &[u8]) -> Result<Array> {
     let (header, body) = split(bytes)?;
     let (descr, fortran, shape) = (text_of(header, "descr")?, is_fortran(header)?, shape_of(header)?);
@@ -42,7 +42,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<Array> {
     Ok(Array::Numbers(shape, row_major))
 }
 
-/// Texts of up to n letters, four bytes each, filled up with zeros.
+/// Texts of up to n letters, four bytes each, padded with zeros.
 fn text(descr: &str, count: usize, body: &[u8]) -> Result<Array> {
     let length = descr.strip_prefix("<U").and_then(|n| n.parse::<usize>().ok()).filter(|n| *n <= LONGEST_TEXT);
     let Some(length) = length else {
@@ -57,7 +57,7 @@ fn text(descr: &str, count: usize, body: &[u8]) -> Result<Array> {
     text.map_or_else(|| invalid("letters that do not exist".into()), |t| Ok(Array::Text(t)))
 }
 
-/// The header (a literal of a Python dict) and what follows it.
+/// Splits the header (a literal of a Python dict) from the data that follow.
 fn split(bytes: &[u8]) -> Result<(&str, &[u8])> {
     let short = |n: &[u8; 2]| u16::from_le_bytes(*n) as usize;
     let long = |n: &[u8; 4]| u32::from_le_bytes(*n) as usize;
@@ -76,7 +76,7 @@ fn split(bytes: &[u8]) -> Result<(&str, &[u8])> {
     }
 }
 
-/// What follows `'name':` in the header.
+/// The part of the header after `'name':`.
 fn value_of<'a>(header: &'a str, name: &str) -> Result<&'a str> {
     let after = [format!("'{name}'"), format!("\"{name}\"")].iter().find_map(|key| header.split_once(key.as_str()));
     match after.and_then(|(_, rest)| rest.trim_start().strip_prefix(':')) {
@@ -102,7 +102,7 @@ fn is_fortran(header: &str) -> Result<bool> {
 fn shape_of(header: &str) -> Result<Vec<usize>> {
     let value = value_of(header, "shape")?;
     let inside = value.strip_prefix('(').and_then(|rest| rest.split_once(')')).map(|(inside, _)| inside);
-    // `(3,)` has a comma behind its only number.
+    // `(3,)` has a comma after its only number.
     let numbers = |inside: &str| {
         let numbers = inside.trim().trim_end_matches(',').split(',').map(str::trim).filter(|n| !n.is_empty());
         numbers.map(|n| n.parse().ok()).collect()
@@ -116,7 +116,7 @@ mod tests {
 
     use super::*;
 
-    /// A file of version 1 with this header, which numpy fills up to 64 bytes.
+    /// A version 1 file with this header, padded to a multiple of 64 bytes as numpy does.
     fn file(header: &str, body: &[u8]) -> Vec<u8> {
         let header = format!("{header:<117}\n");
         let size = (header.len() as u16).to_le_bytes();

@@ -1,11 +1,12 @@
-//! Policies as ONNX models, for runtimes that know nothing of us.
+//! Policies as ONNX models, for other runtimes.
 //!
-//! One input, `observation` (float32 `[batch, d_s]`, in the user's units), and one output, `action` (float32 `[batch, d_a]`, the mean action in
-//! the user's units). Standardisation, clipping and the actions' range are in the graph:
+//! One input, `observation` (float32 `[batch, d_s]`, in the user's units), and one output, `action` (float32
+//! `[batch, d_a]`, the mean action in the user's units). The graph includes standardisation, clipping and the range of
+//! the actions:
 //!
 //! observation → Gather (the dimensions that the network sees) → Sub mean → Div std → Clip → (MatMul → Add → activation)* → head → range → action
 //!
-//! The format is protobuf, of which a model of this kind needs little: numbers, texts, and messages in messages
+//! The format is protobuf. A model of this kind needs only a small part of it: numbers, texts, and nested messages
 //! (onnx.proto3 of ONNX 1.x; IR version 8, operators of version 13).
 
 use std::path::Path;
@@ -24,7 +25,7 @@ const INT64: u64 = 7;
 /// The bytes of a model file for `policy`.
 ///
 /// # Errors
-/// If the policy remembers its episode: a model is a function of the observation.
+/// If the policy has a memory of its episode: a model is a function of the observation only.
 pub fn model(policy: &Policy) -> Result<Vec<u8>, LearnError> {
     let PolicyKind::Mlp(network) = policy.kind() else {
         return Err(LearnError::Policy {
@@ -38,15 +39,15 @@ pub fn model(policy: &Policy) -> Result<Vec<u8>, LearnError> {
     Ok(document(&graph(network, policy)))
 }
 
-/// Writes [`model`] to `path`, whole or not at all.
+/// Writes [`model`] to `path`; the file is complete or absent.
 ///
 /// # Errors
-/// As [`model`], and if the file cannot be written.
+/// As for [`model`], and if the file cannot be written.
 pub fn save(policy: &Policy, path: &Path) -> Result<(), LearnError> {
     Ok(tce_base::write_atomically(path, &model(policy)?)?)
 }
 
-/// A message under construction: fields one behind the other.
+/// A message under construction: its fields, concatenated.
 #[derive(Clone, Debug, Default)]
 struct Message(Vec<u8>);
 
@@ -59,14 +60,14 @@ impl Message {
         self.0.push(value as u8);
     }
 
-    /// A whole number.
+    /// Adds an integer.
     fn number(mut self, field: u64, value: u64) -> Self {
         self.raw_varint(field << 3);
         self.raw_varint(value);
         self
     }
 
-    /// Bytes: a text, a message, or what a tensor holds.
+    /// Adds bytes: a text, a message, or the values of a tensor.
     fn bytes(mut self, field: u64, value: &[u8]) -> Self {
         self.raw_varint(field << 3 | 2);
         self.raw_varint(value.len() as u64);
@@ -90,7 +91,7 @@ struct Graph {
 }
 
 impl Graph {
-    /// A constant tensor.
+    /// Adds a constant tensor.
     fn constant(&mut self, name: &str, shape: &[usize], kind: u64, bytes: &[u8]) {
         let tensor = shape.iter().fold(Message::default(), |m, &size| m.number(1, size as u64));
         let tensor = tensor.number(2, kind).text(8, name).bytes(9, bytes);
@@ -102,7 +103,7 @@ impl Graph {
         self.constant(name, shape, FLOAT, &bytes);
     }
 
-    /// An operator on `inputs`; the name of its output.
+    /// Adds an operator on `inputs`; returns the name of its output.
     fn node(&mut self, operator: &str, inputs: &[&str], axis: Option<u64>) -> String {
         self.nodes += 1;
         let output = format!("{}_{}", operator.to_lowercase(), self.nodes);
@@ -146,7 +147,7 @@ impl Graph {
     }
 }
 
-/// What the network sees of an observation.
+/// Adds the computation of the network's inputs from an observation.
 fn inputs(graph: &mut Graph, spec: &PolicySpec) -> String {
     let mut x = "observation".to_owned();
     if spec.inputs.len() != spec.observations {
@@ -169,7 +170,7 @@ fn graph(policy: &MlpPolicy, whole: &Policy) -> Message {
     let mut x = inputs(&mut graph, spec);
     for layer in 0..=spec.hidden.len() {
         let [weight, bias] = ["weight", "bias"].map(|part| format!("{KEY}.layers.{layer}.{part}"));
-        // A population of one: the first dimension is its only member.
+        // This is a population of one: the first dimension has size 1.
         let ((shape, values), (_, biases)) = (&tensors[&weight], &tensors[&bias]);
         graph.floats(&weight, &shape[1..], values);
         graph.floats(&bias, &[biases.len()], biases);
@@ -186,7 +187,7 @@ fn graph(policy: &MlpPolicy, whole: &Policy) -> Message {
         }
     };
     if let Some(range) = whole.action_range() {
-        // low + (a + 1) 0.5 (high - low), in the order of `ActionRange::to_own`.
+        // low + (a + 1) 0.5 (high - low), computed in the order of `ActionRange::to_own`.
         let width: Vec<f32> = range.low.iter().zip(&range.high).map(|(low, high)| high - low).collect();
         graph.floats("one", &[], &[1.0]);
         graph.floats("half", &[], &[0.5]);
@@ -224,7 +225,7 @@ mod tests {
 
     #[test]
     fn numbers_and_texts_are_protobuf() {
-        // The examples of protobuf's own guide: field 1 = 150, field 2 = "testing".
+        // The examples of protobuf's documentation: field 1 = 150, field 2 = "testing".
         assert_eq!(Message::default().number(1, 150).0, [0x08, 0x96, 0x01]);
         assert_eq!(Message::default().text(2, "testing").0, b"\x12\x07testing");
         let inner = Message::default().number(1, 150);

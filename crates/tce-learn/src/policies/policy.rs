@@ -1,12 +1,12 @@
-//! Trained policies, apart from how they were trained: from what a lane has seen of its episode to its next action.
+//! Trained policies, independent of their training: they map what a lane has seen of its episode to its next action.
 //!
-//! | kind | made by | what it remembers of an episode |
+//! | kind | made by | memory of an episode |
 //! |---|---|---|
-//! | [`MlpPolicy`] | BC, IQL, SAC, other people's programs | nothing |
-//! | [`SequencePolicy`] | Meta-DT | the last steps, and what is left of the return it was promised |
+//! | [`MlpPolicy`] | BC, IQL, SAC, other programs | none |
+//! | [`SequencePolicy`] | Meta-DT | the last steps, and the rest of the requested return |
 //!
-//! Whoever rolls a policy out keeps one [`Memory`] per lane: made at an episode's start by [`Policy::start`], given to
-//! [`Policy::act_with`] beside the observation, told the reward by [`Policy::reward`] after the step.
+//! Code that rolls out a policy keeps one [`Memory`] per lane. [`Policy::start`] creates it at the start of an episode,
+//! [`Policy::act_with`] takes it together with the observation, and [`Policy::reward`] adds the reward after the step.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -21,23 +21,23 @@ use crate::mlp_policy::MlpPolicy;
 use crate::sequence_policy::{self, Recall, SequencePolicy};
 use crate::training::Learner;
 
-/// Key of the range of the actions in a policy file's metadata.
+/// Key of the action range in a policy file's metadata.
 const RANGE: &str = "action_range";
 
 /// One policy, ready to act.
 #[derive(Clone, Debug)]
 pub struct Policy {
     kind: PolicyKind,
-    /// The user's units, where they are not the box [-1, 1].
+    /// The range in the user's units, if it is not the box [-1, 1].
     range: Option<ActionRange>,
 }
 
-/// How a policy comes to its actions.
+/// How a policy chooses its actions.
 #[derive(Clone, Debug)]
 pub enum PolicyKind {
     /// From the observation alone.
     Mlp(Box<MlpPolicy>),
-    /// From the last steps.
+    /// From the last steps of the episode.
     Sequence(Box<SequencePolicy>),
 }
 
@@ -53,12 +53,13 @@ impl From<SequencePolicy> for Policy {
     }
 }
 
-/// What a lane remembers of its episode; empty, and without memory of the heap, for a policy that remembers nothing.
+/// A lane's memory of its episode. It is empty and allocates nothing for a policy without a memory.
 #[derive(Clone, Debug, Default)]
 pub struct Memory(pub(crate) Option<Box<Recall>>);
 
 impl Policy {
-    /// Reads a policy: `.safetensors` (ours, of any kind) or `.npz` (plain arrays of other programs, see [`crate::import`]).
+    /// Reads a policy: `.safetensors` (written by this program, any kind) or `.npz` (plain arrays of other programs,
+    /// see [`crate::import`]).
     ///
     /// # Errors
     /// If the file is missing, damaged, or not a policy.
@@ -83,10 +84,10 @@ impl Policy {
         Self::from_parameters(&NamedParameters::load(path)?, path)
     }
 
-    /// The policy of a file that was read before; `path` is for messages.
+    /// The policy in the parameters of a file; `path` is for messages.
     ///
     /// # Errors
-    /// If it is not a policy.
+    /// If the parameters are not a policy.
     pub fn from_parameters(parameters: &NamedParameters, path: &Path) -> Result<Self, LearnError> {
         let policy: Self = match parameters.metadata.contains_key(sequence_policy::KEY) {
             true => SequencePolicy::from_parameters(parameters, path)?.into(),
@@ -104,28 +105,28 @@ impl Policy {
         Ok(policy.in_units(Some(range)))
     }
 
-    /// The same policy with actions in the user's units: what it learned as -1 and 1 becomes `low` and `high`.
+    /// The same policy with actions in the user's units: the actions -1 and 1 become `low` and `high`.
     pub fn in_units(self, range: Option<ActionRange>) -> Self {
         Self { range, ..self }
     }
 
-    /// The user's units; None: the box [-1, 1].
+    /// The range in the user's units; `None`: the box [-1, 1].
     pub fn action_range(&self) -> Option<&ActionRange> {
         self.range.as_ref()
     }
 
-    /// How it comes to its actions.
+    /// How the policy chooses its actions.
     pub fn kind(&self) -> &PolicyKind {
         &self.kind
     }
 
-    /// [`Self::kind`], to change it.
+    /// [`Self::kind`], mutable.
     #[cfg(test)]
     pub(crate) fn kind_mut(&mut self) -> &mut PolicyKind {
         &mut self.kind
     }
 
-    /// The weights and, in the metadata, what kind of policy it is and its specification. Callers may add metadata of their own
+    /// The weights, with the kind of policy and its specification in the metadata. Callers may add their own metadata
     /// before saving.
     pub fn to_parameters(&self) -> NamedParameters {
         let mut out = match &self.kind {
@@ -138,19 +139,19 @@ impl Policy {
         out
     }
 
-    /// Writes a safetensors file, whole or not at all.
+    /// Writes a safetensors file; it is complete or absent.
     ///
     /// # Errors
-    /// If it cannot be written.
+    /// If the file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), LearnError> {
         Ok(self.to_parameters().save(path)?)
     }
 
-    /// The policy whose action is that of the mean output of `policies` ([`MlpPolicy::average`]); the first one where it is alone or
-    /// remembers something.
+    /// The policy that acts by the mean output of `policies` ([`MlpPolicy::average`]); the first policy if it is the
+    /// only one or has a memory.
     ///
     /// # Panics
-    /// If there is none, or they differ in more than their weights.
+    /// If `policies` is empty, or they differ in more than their weights.
     pub fn average(policies: &[&Self]) -> Self {
         let networks: Option<Vec<&MlpPolicy>> = policies.iter().map(|p| p.as_mlp()).collect();
         match networks {
@@ -168,7 +169,7 @@ impl Policy {
         }
     }
 
-    /// Lengths of an observation and of an action.
+    /// The lengths of an observation and of an action.
     pub fn dims(&self) -> (usize, usize) {
         match &self.kind {
             PolicyKind::Mlp(policy) => (policy.spec().observations, policy.spec().actions),
@@ -176,7 +177,7 @@ impl Policy {
         }
     }
 
-    /// The memory of a lane whose episode begins.
+    /// The memory of a lane at the start of an episode.
     pub fn start(&self) -> Memory {
         match &self.kind {
             PolicyKind::Mlp(_) => Memory::default(),
@@ -184,12 +185,12 @@ impl Policy {
         }
     }
 
-    /// Fills `actions` `[rows, d_a]` for `observations` `[rows, d_s]`, both row-major, of lanes with these `memories`: mean
-    /// actions, or, with one generator per row, sampled ones, of a kind of policy that is random. A row's result depends on
-    /// that row, its memory and its generator only.
+    /// Fills `actions` `[rows, d_a]` for `observations` `[rows, d_s]`, both row-major, of lanes with these `memories`:
+    /// with mean actions, or with sampled ones if there is one generator per row and the policy is random. The result
+    /// of a row depends only on that row, its memory and its generator.
     ///
     /// # Panics
-    /// If the lengths do not fit each other, or a memory is another policy's.
+    /// If the lengths do not match, or a memory belongs to another policy.
     pub fn act_with(
         &self,
         observations: &[f32],
@@ -200,7 +201,7 @@ impl Policy {
         match &self.kind {
             PolicyKind::Mlp(policy) => policy.act(observations, rngs, actions),
             PolicyKind::Sequence(policy) => {
-                // What it remembers of its actions are those of the box.
+                // The actions in the memory are those of the box [-1, 1].
                 let recalls = memories.iter_mut().map(|m| m.0.as_deref_mut().expect("a memory of this policy"));
                 policy.act(observations, &mut recalls.collect::<Vec<_>>(), actions);
             }
@@ -210,16 +211,16 @@ impl Policy {
         }
     }
 
-    /// [`Policy::act_with`] at the beginning of episodes; for a policy that remembers nothing, at any time.
+    /// [`Policy::act_with`] at the start of episodes; for a policy without a memory, at any time.
     ///
     /// # Panics
-    /// If the lengths do not fit each other.
+    /// If the lengths do not match.
     pub fn act(&self, observations: &[f32], rngs: Option<&mut [Rng]>, actions: &mut [f32]) {
         let mut memories = vec![self.start(); observations.len() / self.dims().0];
         self.act_with(observations, &mut memories, rngs, actions);
     }
 
-    /// Tells a lane's memory the reward of the last action.
+    /// Adds the reward of the last action to a lane's memory.
     pub fn reward(&self, memory: &mut Memory, reward: f64) {
         if let Some(recall) = &mut memory.0 {
             recall.reward(reward);
@@ -227,13 +228,13 @@ impl Policy {
     }
 }
 
-/// What a file is that begins like one of another format; None for what may be safetensors, or cannot be read.
+/// The format of a file that starts like another format; `None` if it may be safetensors or cannot be read.
 fn other_format(path: &Path) -> Option<&'static str> {
     let mut start = Vec::new();
     std::fs::File::open(path).ok()?.take(10).read_to_end(&mut start).ok()?;
     match start.as_slice() {
         [b'P', b'K', 3, 4, ..] => Some("a zip archive, such as a PyTorch checkpoint (.pt), or an .npz of another name"),
-        // Protocol 2 to 5; a length of safetensors has six zero bytes behind the first two.
+        // Pickle protocols 2 to 5; a safetensors length has six zero bytes after the first two.
         [0x80, 2..=5, rest @ ..] if rest.get(..6) != Some(&[0; 6]) => {
             Some("a Python pickle, such as an old PyTorch checkpoint")
         }
@@ -245,7 +246,7 @@ fn other_format(path: &Path) -> Option<&'static str> {
 
 /// A learner whose result is one policy per member.
 pub trait PolicyLearner: Learner {
-    /// The policies as they are now, in the order of the members.
+    /// The current policies, in the order of the members.
     fn policies(&self) -> Vec<Policy>;
 }
 

@@ -1,13 +1,13 @@
-//! Policies with a memory: a decision transformer on the last steps of an episode (see [`crate::meta_dt`]).
+//! Policies with a memory: a decision transformer over the last steps of an episode (see [`crate::meta_dt`]).
 //!
-//! | what the network sees at step t of an episode | here |
+//! | network input at step t of an episode | here |
 //! |---|---|
-//! | R̂_1 = the return it is asked for | `first_return` |
+//! | R̂_1 = the requested return | `first_return` |
 //! | R̂_t = R̂_1 - r_1 - ... - r_(t-1), over `return_scale` | [`Recall`] |
-//! | z_t, the context of the h steps before | computed once and remembered |
-//! | the last K steps (R̂, s, z, a), this one included | [`Recall`] |
+//! | z_t, the context of the h steps before | computed once and stored |
+//! | the last K steps (R̂, s, z, a), including this one | [`Recall`] |
 //!
-//! The action is the network's, which is deterministic: there is nothing to sample.
+//! The network is deterministic, so actions are not sampled.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -26,13 +26,13 @@ use crate::transformer::{DecisionTransformer, TransformerInput, TransformerSizes
 /// Key of the specification in a policy file's metadata.
 pub(crate) const KEY: &str = "sequence_policy";
 
-/// Greatest K. A file's weights say nothing of K, and attention takes memory for its square.
+/// Largest K. The weights in a file do not determine K, and the memory for attention grows with its square.
 pub(crate) const MAX_CONTEXT: usize = 1024;
 
-/// What the parameters' names begin with.
+/// Prefix of the parameters' names.
 const PREFIX: &str = "policy";
 
-/// Everything about a [`SequencePolicy`] but its weights.
+/// The specification of a [`SequencePolicy`]: everything except its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SequenceSpec {
@@ -40,15 +40,15 @@ pub struct SequenceSpec {
     pub observations: usize,
     /// Length of an action.
     pub actions: usize,
-    /// The observation dimensions the networks see, ascending.
+    /// The observation dimensions that the networks see, ascending.
     pub inputs: Vec<usize>,
-    /// Of all observation dimensions.
+    /// Covers all observation dimensions.
     pub standardizer: Standardizer,
-    /// K, the steps the transformer sees.
+    /// K, the number of steps that the transformer sees.
     pub context: usize,
-    /// What gives contexts.
+    /// Sizes of the network that computes contexts.
     pub encoder: EncoderSizes,
-    /// What gives actions.
+    /// Sizes of the network that computes actions.
     pub transformer: TransformerSizes,
     /// Divides every R̂.
     pub return_scale: f64,
@@ -57,7 +57,7 @@ pub struct SequenceSpec {
 }
 
 impl SequenceSpec {
-    /// What is wrong with it: field, found, expected. `numbers` are those a file holds.
+    /// The first error in the specification: field, found, expected. `numbers` is the number of weights in the file.
     fn fault(&self, numbers: usize) -> Option<(&'static str, String, String)> {
         let (n, e, t) = (self.observations, &self.encoder, &self.transformer);
         let sizes = [self.context, e.horizon, e.features, e.hidden, t.embed, t.layers, t.heads, t.timesteps];
@@ -85,13 +85,13 @@ impl SequenceSpec {
             let found = format!("{}, {}", self.return_scale, self.first_return);
             return Some(("return_scale, first_return", found, "a positive number and a finite one".into()));
         }
-        // Before memory is taken for a network that a damaged file only promises.
+        // Checked before memory is allocated for a network that a damaged file only declares.
         let expected = e.parameters() + t.parameters();
         (numbers as f64 != expected).then(|| ("weights", format!("{numbers} numbers"), format!("{expected}")))
     }
 }
 
-/// Encoder and transformer, as a policy needs them.
+/// Encoder and transformer of a policy.
 #[derive(Module, Debug)]
 struct Networks {
     encoder: ContextEncoder,
@@ -105,12 +105,12 @@ pub struct SequencePolicy {
     networks: Networks,
 }
 
-/// What a lane remembers of its episode.
+/// A lane's memory of its episode.
 #[derive(Clone, Debug)]
 pub(crate) struct Recall {
-    /// The last steps, at least K and h of them if there were so many; the newest is last.
+    /// The last steps, up to max(K, h) of them; the newest is last.
     steps: VecDeque<Past>,
-    /// Steps so far.
+    /// Number of steps so far.
     time: usize,
     return_to_go: f64,
 }
@@ -131,7 +131,7 @@ impl Recall {
         self.steps.back_mut().expect("a step").action.copy_from_slice(action);
     }
 
-    /// Takes the reward of the newest step.
+    /// Stores the reward of the newest step.
     pub(crate) fn reward(&mut self, reward: f64) {
         self.return_to_go -= reward;
         if let Some(step) = self.steps.back_mut() {
@@ -141,7 +141,7 @@ impl Recall {
 }
 
 impl SequencePolicy {
-    /// A policy of the given weights, named `policy.encoder...` and `policy.transformer...`; `path` is where they came from.
+    /// A policy with the given weights, named `policy.encoder...` and `policy.transformer...`; `path` is for messages.
     ///
     /// # Errors
     /// If the specification contradicts itself or the weights do not fit it.
@@ -159,7 +159,7 @@ impl SequencePolicy {
         Ok(Self { spec, networks })
     }
 
-    /// The policy of trained networks.
+    /// The policy with these trained networks.
     pub(crate) fn of(spec: SequenceSpec, encoder: &ContextEncoder, transformer: &DecisionTransformer) -> Self {
         let mut weights = NamedParameters::default();
         weights.collect(&format!("{PREFIX}.encoder"), encoder);
@@ -167,12 +167,12 @@ impl SequencePolicy {
         Self::new(spec, &weights, Path::new("(in memory)")).expect("the networks were made from the specification")
     }
 
-    /// What it is, without the weights.
+    /// The specification.
     pub fn spec(&self) -> &SequenceSpec {
         &self.spec
     }
 
-    /// The same, asked for another return.
+    /// The same policy with another requested return.
     #[cfg(test)]
     pub(crate) fn asked(&mut self, first_return: f64) -> &Self {
         self.spec.first_return = first_return;
@@ -198,7 +198,7 @@ impl SequencePolicy {
         out
     }
 
-    /// The memory of a lane whose episode begins.
+    /// The memory of a lane at the start of an episode.
     pub(crate) fn start(&self) -> Recall {
         Recall { steps: VecDeque::new(), time: 0, return_to_go: self.spec.first_return }
     }
@@ -225,11 +225,11 @@ impl SequencePolicy {
         }
     }
 
-    /// Takes the observations into the memories, with their contexts.
+    /// Adds the observations to the memories, with their contexts.
     fn see(&self, observations: &[f32], memories: &mut [&mut Recall]) {
         let spec = &self.spec;
         let (rows, h, d, a) = (memories.len(), spec.encoder.horizon, spec.inputs.len(), spec.actions);
-        // Steps before the episode's beginning are zeros.
+        // Steps before the start of the episode are zeros.
         let mut strip = [vec![0.0; rows * h * d], vec![0.0; rows * h * a], vec![0.0; rows * h]];
         for (row, memory) in memories.iter().enumerate() {
             let known = memory.steps.len().min(h);
@@ -262,7 +262,7 @@ impl SequencePolicy {
         }
     }
 
-    /// The last K steps of every memory, the oldest first; zeros behind them where there are fewer.
+    /// The last K steps of every memory, the oldest first; padded with zeros if there are fewer.
     fn recent(&self, memories: &[&mut Recall]) -> TransformerInput {
         let spec = &self.spec;
         let (rows, k) = (memories.len(), spec.context);

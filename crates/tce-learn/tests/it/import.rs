@@ -1,4 +1,4 @@
-//! Policies of other programs: against formulas written out in f64, and against all files of the shared collection.
+//! Tests of policies of other programs: against formulas in f64, and with all files of the shared collection.
 
 use std::fs::File;
 use std::io::Write;
@@ -12,14 +12,14 @@ use zip::write::FileOptions;
 /// One array of a file: name, shape, row-major values.
 type Array = (&'static str, Vec<u64>, Vec<f64>);
 
-/// How numpy stores a matrix.
+/// The order in which numpy stores a matrix.
 #[derive(Clone, Copy, PartialEq)]
 enum Order {
     C,
     Fortran,
 }
 
-/// An array as numpy's `save` writes it.
+/// An array in the format of numpy's `save`.
 fn npy(descr: &str, order: Order, shape: &[u64], body: impl Iterator<Item = u8>) -> Vec<u8> {
     let shape: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let fortran = if order == Order::Fortran { "True" } else { "False" };
@@ -29,7 +29,7 @@ fn npy(descr: &str, order: Order, shape: &[u64], body: impl Iterator<Item = u8>)
     [b"\x93NUMPY\x01\x00".as_slice(), &size, header.as_bytes()].concat().into_iter().chain(body).collect()
 }
 
-/// An archive as numpy's `savez_compressed` writes it.
+/// An archive in the format of numpy's `savez_compressed`.
 fn write(path: &Path, texts: &[(&str, &str)], arrays: &[Array], order: Order) {
     let mut npz = ZipWriter::new(File::create(path).unwrap());
     let mut add = |name: &str, bytes: Vec<u8>| {
@@ -143,7 +143,7 @@ fn sac_and_linear_kinds_follow_their_formulas() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("policy.npz");
     let mut arrays = weights();
-    // ln σ = 5.., which the formula clips to 2, and something in range.
+    // One ln σ above 2, which the formula clips to 2, and one within the range.
     arrays.extend([numbers("ws", &[2, 3], 0.1), ("bs", vec![2], vec![9.0, -0.5])]);
     write(&path, &[("kind", "sac_tanh_gaussian"), ("act", "relu")], &arrays, Order::C);
     let get = |name: &str| arrays.iter().find(|a| a.0 == name).unwrap().2.clone();
@@ -212,7 +212,7 @@ fn every_shared_policy_loads_and_acts_in_the_box() {
         let mut rngs: Vec<_> = (0..3).map(|i| Streams::new(0).indexed("a", i)).collect();
         policy.act(&o, Some(&mut rngs), &mut a);
         assert!(a.iter().all(|a| a.abs() <= 1.0), "{}", path.display());
-        // A second way through a file of our own keeps the policy.
+        // A second import of our own file gives the same policy.
         let dir = tempfile::tempdir().unwrap();
         let own = dir.path().join("own.safetensors");
         policy.save(&own).unwrap();

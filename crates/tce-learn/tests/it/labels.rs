@@ -1,4 +1,4 @@
-//! Inverse dynamics, rewards and terminals on a system whose laws are known.
+//! Tests of inverse dynamics, rewards and terminals on a system with known laws.
 
 use std::sync::Arc;
 
@@ -50,7 +50,7 @@ fn labels_follow_the_laws_of_the_system() {
         assert!(errors.reward_rmse < 0.1 * errors.reward_std, "{errors:?}");
         assert!(errors.terminal_error.unwrap() < 0.05, "{errors:?}");
     }
-    // One row in the box, one whose action would be (3, 0); the second member has another number of rows.
+    // One action in the box, one that would be (3, 0); the second member has another number of rows.
     let s = vec![1.0, 0.0, 1.0, 1.0, 0.0, 1.0];
     let s2 = vec![1.02, -0.03, 1.0, 1.15, 0.0, 1.0];
     let ends = (vec![2.6, 0.0, 1.0], vec![2.6, 0.01, 1.0]);
@@ -74,7 +74,7 @@ fn labels_follow_the_laws_of_the_system() {
     assert!(models.label(&generated[..1], TerminalHandling::None).is_err());
 }
 
-/// Where the target's rows never end an episode, the source's tell which states do.
+/// The target's rows never end an episode; the source's rows show which states do.
 #[test]
 fn terminals_are_learned_from_both_domains() {
     let source = data(2000);

@@ -1,4 +1,4 @@
-//! Learners end to end on small problems with known answers.
+//! Tests of complete learners on small problems with known answers.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -97,7 +97,7 @@ fn cloning_by_likelihood_learns_mean_and_spread() {
     }
 }
 
-/// a = sin(3 x) / 2 + noise of .3, as a sampled behaviour has it; few rows.
+/// a = sin(3 x) / 2 + noise of .3, as from a sampled behaviour policy; few rows.
 fn noisy_data() -> Arc<Transitions> {
     let mut rng = Streams::new(5).stream("noisy");
     let mut t = Transitions::new(1, 1);
@@ -117,7 +117,7 @@ fn dropout_keeps_a_clone_from_fitting_the_noise_of_its_rows() {
         let actor = ActorConfig { hidden: vec![128, 128, 128], lr: 1e-3, ..ActorConfig::default() };
         let mut bc = Bc::new(&buffer, &BcConfig { actor, dropout, ..BcConfig::default() }, 1500, &cpu()).unwrap();
         run(&mut bc, &buffer, 1500);
-        // At the rows themselves: what is fitted there beyond the behaviour's mean is noise.
+        // At the training rows themselves, anything fitted beyond the behaviour's mean is noise.
         let square = |policy: &Policy, i: usize| (action(policy, data.observation(i))[0] - data.action(i)[0]).powi(2);
         let policies = bc.policies();
         let all = policies.iter().flat_map(|p| (0..data.len()).map(|i| square(p, i)));
@@ -206,8 +206,8 @@ fn a_resumed_training_goes_on_as_if_nothing_had_happened() {
     assert!(error.to_string().contains("other.safetensors"), "{error}");
 }
 
-/// A corridor: s = position in [-1, 1], a moves it by a/5, the reward is the new position. The behaviour goes left and
-/// right at random, so the mean action is 0 and the good one is +1.
+/// A corridor: s = position in [-1, 1], a moves it by a/5, the reward is the new position. The behaviour moves left and
+/// right at random, so the mean action is 0 and the best one is +1.
 fn corridor() -> Arc<Transitions> {
     let mut rng = Streams::new(4).stream("corridor");
     let mut t = Transitions::new(1, 1);
@@ -275,7 +275,7 @@ fn weights_stay_with_their_rows() {
     assert!((loss[0] - expected).abs() < 1e-6, "{loss:?} {expected}");
 }
 
-/// With a strong term the policy goes to the target's behaviour (always right), although the source part (always
+/// With a strong term the policy approaches the target's behaviour (always right), although the source part (always
 /// left) is half of every batch.
 #[test]
 fn regularisers_pull_the_policy_to_the_target_behaviour() {
@@ -307,7 +307,7 @@ fn regularisers_pull_the_policy_to_the_target_behaviour() {
     }
 }
 
-/// Two corridors, of which in the second the rows that go right are called target-like.
+/// Two corridors. In the second, rows that move right have high scores.
 fn scored_member(seed: u64) -> Member {
     let target = corridor();
     let others = corridor();
@@ -328,7 +328,7 @@ fn new_dmc(buffer: &Buffer, config: &DmcConfig, steps: u64) -> Result<Dmc, Learn
     Dmc::new(buffer, config, &corridor_config(), regulariser, steps, &cpu())
 }
 
-/// Everything of one update against the same of IQL on the rows and weights that the definition names.
+/// Compares all results of one update with those of IQL on the rows and weights in the definition.
 #[test]
 fn dmc_is_iql_on_the_kept_rows_with_their_weights() {
     use tce_learn::Meter;
@@ -382,8 +382,8 @@ fn dmc_goes_on_from_its_state_and_refuses_rows_without_scores() {
     assert!(error(bad).contains("a finite number for each"));
 }
 
-/// The good action is +1, the behaviour's mean 0: corrected finds it, published clones whatever the filter leaves (two thirds of
-/// the kept rows go right), as its weights do not tell rows apart.
+/// The best action is +1, the behaviour's mean is 0. Corrected mode finds it. Published mode clones the rows left by
+/// the filter (two thirds of them move right), because its weights do not distinguish rows.
 #[test]
 fn dmc_learns_and_its_modes_differ() {
     let buffer = Buffer::new(vec![scored_member(1)], 64).unwrap();

@@ -1,4 +1,4 @@
-//! Tests of `tce-learn` from outside. One binary: linking each file by itself takes longer than the tests.
+//! Integration tests of `tce-learn`, in one binary: linking each file separately takes longer than the tests.
 
 mod common;
 mod import;

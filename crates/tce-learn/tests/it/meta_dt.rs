@@ -1,4 +1,4 @@
-//! Meta-DT end to end on small problems, and what must hold of it whatever it learns.
+//! Tests of Meta-DT on small problems, and of properties that hold whatever it learns.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,8 +11,8 @@ use tce_learn::world_model::{WorldModelConfig, Worlds};
 use tce_learn::{Buffer, Learner, Member, MetaDt, MetaDtConfig, Meter, Place, Policy, PolicyKind, PolicyLearner};
 use tce_nn::{NamedParameters, cpu};
 
-/// A corridor: s = position, a moves it by a/5, the reward is the new position. An episode goes all the way left or all the
-/// way right, and by no more than its return can one tell beforehand which.
+/// A corridor: s = position, a moves it by a/5, the reward is the new position. An episode moves all the way left or
+/// all the way right, and only its return shows beforehand which.
 fn corridor(name: &str, episodes: usize) -> Arc<Transitions> {
     let mut rng = Streams::new(4).stream(name);
     let mut t = Transitions::new(1, 1);
@@ -61,12 +61,12 @@ fn small(world_steps: u64) -> MetaDtConfig {
     }
 }
 
-/// With a world model that has been trained.
+/// A learner with a trained world model.
 fn prepared(buffer: &Buffer, config: &MetaDtConfig) -> MetaDt {
     MetaDt::new(buffer, config, Place::NONE, &cpu()).unwrap().expect("not interrupted")
 }
 
-/// Return of an episode from 0.
+/// Return of an episode that starts at 0.
 fn rollout(policy: &Policy) -> f32 {
     let (mut memory, mut x, mut sum, mut a) = ([policy.start()], 0.0f32, 0.0, [0.0]);
     for _ in 0..STEPS {
@@ -78,7 +78,7 @@ fn rollout(policy: &Policy) -> f32 {
     sum
 }
 
-/// Cloning would go nowhere: the mean action of the data is 0 where an episode begins.
+/// Cloning would not move: the mean action of the data is 0 at the start of an episode.
 #[test]
 fn it_does_what_the_return_it_is_asked_for_says() {
     let buffer = Buffer::new(vec![two_parts(1)], 2).unwrap();
@@ -92,7 +92,7 @@ fn it_does_what_the_return_it_is_asked_for_says() {
     assert!(trained.tensors.iter().all(|(name, t)| state.tensors[name] == *t), "another world model was prepared");
     let report = go(&mut learner, &buffer, 0, 500);
     assert!(report.metrics["policy_loss"][0].is_finite());
-    // An action of 1 all the time earns 12.
+    // An action of 1 at every step has return 12.
     let best = rollout(&learner.policies()[0]);
     assert!(best > 9.0, "{best}");
     let worst = MetaDtConfig { return_factor: -1.0, ..config };
@@ -102,7 +102,7 @@ fn it_does_what_the_return_it_is_asked_for_says() {
     assert!(worst < -9.0, "{worst}");
 }
 
-/// A training of 7 steps, stopped within.
+/// A training run of 7 steps that is stopped and resumed.
 fn resumed<L: Learner>(buffer: &Buffer, new: impl Fn() -> L) -> L {
     let mut whole = new();
     go(&mut whole, buffer, 0, 7);
@@ -139,7 +139,7 @@ fn a_member_equals_a_run_of_its_own() {
     assert_eq!(learn(vec![two_parts(1), two_parts(2)]), learn(vec![two_parts(2)]));
 }
 
-/// At the full size, where burn's products of matrices are spread over threads.
+/// At full size, where burn distributes matrix products over threads.
 #[test]
 fn the_bytes_do_not_depend_on_the_number_of_threads() {
     let learn = |threads: usize| {
@@ -157,7 +157,7 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
     assert!(learn(1) == learn(3), "another number of threads gave other parameters");
 }
 
-/// A table without an order of time is a table of episodes of one step.
+/// A table without an order of time is a table of one-step episodes.
 #[test]
 fn generated_rows_are_learned_from_too() {
     let mut t = Transitions::new(1, 1);
@@ -229,7 +229,7 @@ fn bad_configurations_are_refused() {
     assert!(set(|c| c.world_model.horizon = 0).contains("world_model.horizon"));
 }
 
-/// Nanoseconds of a core that this thread has had: other programs may be using the machine.
+/// CPU time of this thread in nanoseconds: other programs may be using the machine.
 fn used() -> f64 {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
     text.split(' ').next().and_then(|n| n.parse().ok()).unwrap_or(0.0)

@@ -1,4 +1,4 @@
-//! Prior methods and the deterministic actor-critics, end to end on a corridor.
+//! Tests of prior methods and the deterministic actor-critics on a corridor.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,8 +16,8 @@ use tce_learn::{
 };
 use tce_nn::{NamedParameters, cpu};
 
-/// s = position in [-1, 1], a moves it by a/5 (`against`: by -a/5), the reward is the new position. The behaviour goes left and
-/// right at random: the mean action is 0, the good one +1.
+/// s = position in [-1, 1], a moves it by a/5 (`against`: by -a/5), the reward is the new position. The behaviour moves
+/// left and right at random: the mean action is 0, the best one +1.
 fn corridor(seed: u64, episodes: usize, against: f64) -> Transitions {
     let mut rng = Streams::new(seed).stream("corridor");
     let mut t = Transitions::new(1, 1);
@@ -34,7 +34,7 @@ fn corridor(seed: u64, episodes: usize, against: f64) -> Transitions {
     t
 }
 
-/// A fifth of the source moves the other way round.
+/// A fifth of the source moves in the opposite direction.
 fn member(seed: u64) -> Member {
     let (target, source) = (corridor(4, 60, 0.0), corridor(5, 300, 0.2));
     let fit = |i: usize| {
@@ -94,7 +94,7 @@ fn method(name: &str, mode: Mode, buffer: &Buffer, steps: u64) -> Box<dyn Policy
         }
         "bosa" => {
             let cvae = cvae(300);
-            // The sparse support of two actions leaves no gradient between them; a light weight lets the value decide.
+            // The data have only two actions, with no gradient between them; with a small weight, the value decides.
             let config = BosaConfig {
                 mode,
                 cvae,
@@ -130,7 +130,7 @@ fn method(name: &str, mode: Mode, buffer: &Buffer, steps: u64) -> Box<dyn Policy
     }
 }
 
-/// Mean reward of 20 steps in the target's corridor; 0 for actions at random, .6 and more for going right.
+/// Mean reward of 20 steps in the target's corridor; 0 for random actions, .6 and more for moving right.
 fn walk(policy: &Policy) -> f32 {
     let (mut x, mut sum, mut a) = (-0.5f32, 0.0, [0.0]);
     for _ in 0..20 {
@@ -150,13 +150,13 @@ fn every_method_improves_over_random() {
         let score = walk(&learner.policies()[0]);
         assert!(score > 0.3, "{name}: {score}, {:?}", report.metrics);
         assert!(report.diverged().is_empty(), "{name}: {:?}", report.metrics);
-        // Which is not trained at every step.
+        // These methods do not train the policy at every step.
         let delayed = ["bosa", "td3-bc", "rebrac"].contains(&name);
         assert_eq!(report.metrics.contains_key("policy_value"), delayed, "{name}: {:?}", report.metrics);
     }
 }
 
-/// What is published of OTDF clones the mean action; of BOSA, learns from the immediate reward, which is enough here.
+/// Published OTDF clones the mean action. Published BOSA learns from the immediate reward, which is enough here.
 #[test]
 fn the_published_otdf_does_not_improve() {
     let buffer = Buffer::new(vec![member(1)], 64).unwrap();
@@ -166,7 +166,7 @@ fn the_published_otdf_does_not_improve() {
     assert!(score < 0.2, "{score}");
 }
 
-/// Before its first step, IGDF's two modes of ODRL differ in the encoders and in nothing else.
+/// Before its first step, IGDF's two modes of ODRL differ only in the encoders.
 #[test]
 fn the_published_igdf_chooses_by_networks_as_they_were_drawn() {
     let buffer = Buffer::new(vec![member(1)], 64).unwrap();

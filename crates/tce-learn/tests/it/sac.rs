@@ -1,4 +1,4 @@
-//! Soft actor-critic: its densities, its gradients, and what it learns where the best action is known.
+//! Tests of soft actor-critic: its densities, its gradients, and its result where the best action is known.
 
 use std::sync::Arc;
 
@@ -48,7 +48,8 @@ fn the_squashed_density_is_that_of_the_formula() {
     let output = actor.forward(s.clone());
     let (action, log_prob) = output.sample_with_log_prob(&buffer.streams(), "n", 3);
     let (action, log_prob) = (host(action), host(log_prob));
-    // μ and σ out of three draws of known noise would need the network's insides: take them from the policy's file.
+    // μ and σ are read from the policy's file: from three draws of known noise, the network's internals would be
+    // needed.
     let policy = actor.policies().remove(0).to_parameters().tensors;
     let w = |k: usize, part: &str| policy[&format!("policy.layers.{k}.{part}")].1.clone();
     let (w0, b0, w1, b1) = (w(0, "weight"), w(0, "bias"), w(1, "weight"), w(1, "bias"));
@@ -94,7 +95,7 @@ fn it_finds_the_best_action_of_a_bandit() {
         policy.act(&s, None, &mut a);
         assert!(s.iter().zip(a).all(|(s, a)| (a - 0.8 * s).abs() < 0.15), "{a:?}");
     }
-    // The temperature has fallen far from 1, towards an entropy of -2.
+    // The temperature has decreased far below 1, towards an entropy of -2.
     assert!(sac.alpha().iter().all(|a| *a < 0.3), "{:?}", sac.alpha());
 }
 

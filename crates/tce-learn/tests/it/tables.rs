@@ -1,4 +1,4 @@
-//! Tables in the doc comments beside the values that they tell.
+//! Compares the tables in doc comments with the actual values.
 
 use serde_json::{Value, json};
 use tce_learn::cvae::CvaeConfig;
@@ -9,14 +9,14 @@ use tce_learn::{
     LabelConfig, MetaDtConfig, OtdfConfig, RebracConfig, RegulariserConfig, SrpoConfig, Td3BcConfig,
 };
 
-/// The file of a table below `src/`, and the configuration that it describes.
+/// The file of a table below `src/`, and the configuration that the table describes.
 macro_rules! tables {
     ($($file:literal: $config:expr;)*) => {
         [$(($file, include_str!(concat!("../../src/", $file)), json!($config)),)*]
     };
 }
 
-/// `.5`, `10 000`, `3e-4` or the end of `√(.4/4) = .316`, at the beginning of a cell or of one of its parts.
+/// Parses `.5`, `10 000`, `3e-4` or the end of `√(.4/4) = .316`, at the beginning of a cell or of one of its parts.
 fn number(text: &str) -> Option<f64> {
     let text = text.rsplit('=').next()?.trim();
     let mut digits = String::new();
@@ -31,7 +31,7 @@ fn number(text: &str) -> Option<f64> {
     digits.trim_end_matches('e').parse().ok()
 }
 
-/// What a cell says of `found`: a number or a list of numbers; None if it says neither.
+/// Whether a cell agrees with `found`, a number or a list of numbers; `None` if it cannot be compared.
 fn agrees(cell: &str, found: &Value) -> Option<bool> {
     let close = |a: f64, b: f64| (a - b).abs() <= 2e-3 * b.abs();
     match found {
@@ -76,7 +76,7 @@ fn tables_tell_the_values() {
             let names: Vec<&str> = fields.split('`').skip(1).step_by(2).collect();
             let several = names.len() > 1;
             for (k, name) in names.iter().enumerate() {
-                // `std`² tells a square.
+                // `std`² means that the cell gives the square.
                 if fields.contains(&format!("`{name}`²")) {
                     continue;
                 }
