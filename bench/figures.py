@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Draws docs/images/results.svg from bench/clones.json: target rows alone, with generated rows, and the paper's figures.
+"""Draws docs/images/results.svg from the records in bench/results: our policies, and the paper's TCE(OG) and best other method.
 
     pip install matplotlib && python3 bench/figures.py
 """
 import json
+from collections import defaultdict
 from pathlib import Path
 
 import matplotlib
@@ -12,31 +13,59 @@ matplotlib.use("svg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
-SERIES = [("alone", "target rows alone", "#6b7a8f"), ("with", "with generated rows", "#d9772b"), ("paper", "the paper's TCE(OG)", "#c9ced6")]
+PAPER = HERE.parent / "crates/tce-report/paper"
+AGENTS = {"halfcheetah": "HalfCheetah", "hopper": "Hopper", "walker2d": "Walker2d", "ant": "Ant"}
+SHIFTS = ["morph", "kinematic", "gravity"]
+OURS = [("bc-ensemble", "five clones of the target rows, ours", "#3d6b94"), ("tce-og", "with generated rows, ours", "#d9772b")]
+THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", "#dfe2e7")]
+
+
+def scores():
+    """Scores of single runs by task and method, of columns with a preset's own settings."""
+    found = defaultdict(dict)
+    for path in sorted((HERE / "results").glob("*.jsonl")):
+        for line in map(json.loads, path.read_text().splitlines()):
+            run = line.get("run")
+            if run and run["recipe"]["preset"] == "default":
+                for member in run["folder"]["members"]:
+                    found[run["task"], run["method"]][member["seed"]] = member["verdict"]["score"]
+    return {key: [seeds[k] for k in sorted(seeds)] for key, seeds in found.items()}
+
+
+def paper(shift, agent):
+    """TCE(OG) and the best method that is not TCE, medium source, expert target."""
+    lines = [line.split("\t") for line in (PAPER / f"{shift}.tsv").read_text().splitlines() if not line.startswith("#")]
+    names, rows = lines[2][3:], lines[3:]
+    row = next(row for row in rows if row[:3] == [agent, "medium", "expert"])
+    values = {name: float(cell.split("±")[0]) for name, cell in zip(names, row[3:]) if "±" in cell}
+    others = [value for name, value in values.items() if not name.startswith(("TCE", "Simple"))]
+    return {"TCE(OG)": values["TCE(OG)"], "best": max(others)}
 
 
 def main():
-    cells = json.loads((HERE / "clones.json").read_text())["cells"]
-    plt.rcParams.update({"font.size": 10, "svg.hashsalt": "tce", "svg.fonttype": "none"})
-    figure, axes = plt.subplots(figsize=(8, 3.2))
-    for k, (key, label, colour) in enumerate(SERIES):
-        where = [i + (k - 1) * 0.27 for i in range(len(cells))]
-        means = [sum(c[key]) / len(c[key]) if c.get(key) else 0 for c in cells]
-        axes.bar(where, means, 0.25, color=colour, label=label)
-        for x, cell, mean in zip(where, cells, means):
-            values = cell.get(key) or []
-            if len(values) > 1:
-                axes.plot([x] * len(values), values, "k_", markersize=6)
-            axes.text(x, max([mean, *values]) + 1.5, f"{mean:.0f}" if values else "–", ha="center", fontsize=8)
-    axes.axhline(100, color="#999", linewidth=0.8, linestyle=":")
-    axes.set_xticks(range(len(cells)), [c["name"] for c in cells])
-    axes.set_ylabel("normalised score")
-    axes.set_ylim(0, 119)
-    axes.legend(ncols=3, frameon=False, loc="upper center", fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
+    ours = scores()
+    plt.rcParams.update({"font.size": 9, "svg.hashsalt": "tce", "svg.fonttype": "none"})
+    figure, axes = plt.subplots(len(SHIFTS), 1, figsize=(8, 7.2), sharey=True)
+    for axis, shift in zip(axes, SHIFTS):
+        for k, (key, label, colour) in enumerate(OURS + THEIRS):
+            for place, agent in enumerate(AGENTS):
+                values = ours.get((f"{agent}-{shift}:medium->expert", key), []) if k < 2 else [paper(shift, agent)[key]]
+                x = place + (k - 1.5) * 0.21
+                mean = sum(values) / len(values) if values else 0
+                axis.bar(x, mean, 0.19, color=colour, label=label if place == 0 else None)
+                if len(values) > 1:
+                    axis.plot([x] * len(values), values, "k_", markersize=5)
+                axis.text(x, max([mean, *values]) + 2, f"{mean:.0f}" if values else "–", ha="center", fontsize=8)
+        axis.axhline(100, color="#999", linewidth=0.8, linestyle=":")
+        axis.set_xticks(range(len(AGENTS)), AGENTS.values())
+        axis.set_ylim(0, 139)
+        axis.set_yticks([0, 25, 50, 75, 100])
+        axis.set_title(shift, loc="left", fontsize=10, fontweight="bold")
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].legend(ncols=2, frameon=False, loc="lower right", bbox_to_anchor=(1, 1.02), fontsize=8)
+    axes[1].set_ylabel("normalised score")
     figure.tight_layout()
     out = HERE.parent / "docs/images/results.svg"
-    out.parent.mkdir(exist_ok=True)
     figure.savefig(out, metadata={"Date": None})
 
 

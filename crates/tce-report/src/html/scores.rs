@@ -56,31 +56,6 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
             (*c, format!("{class}{}", if k == 0 { " edge" } else { "" }).trim().to_owned())
         })
         .collect();
-    let of = |n: usize| html! { @if n < t.rows.len() { br; small { "of " (counted(n, "task", "tasks")) } } };
-    let total = |c: Column| match c {
-        Column::Ours(m) => html! {
-            @match &t.totals[m] {
-                None => "–",
-                Some(Total { estimate, tasks }) => {
-                    (one(estimate.point)) br; small { (range(estimate.interval, 1)) } (of(*tasks))
-                }
-            }
-        },
-        Column::Paper(c) => match t.paper_totals[c] {
-            (_, 0) => html! { "–" },
-            (sum, n) => html! { (one(sum)) (of(n)) },
-        },
-    };
-    let iqm = |c: Column| match c {
-        Column::Ours(m) => html! {
-            @match &t.iqms[m] {
-                None => "–",
-                Some(Total { estimate, .. }) => { (one(estimate.point)) br; small { (range(estimate.interval, 1)) } }
-            }
-        },
-        // The paper does not print single runs.
-        Column::Paper(_) => html! { "–" },
-    };
     html! {
         h3 { (shift_title(t.shift)) }
         @if let Some(doubt) = &t.doubt { p class="doubt" { (doubt) } }
@@ -108,24 +83,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Markup {
                 }
                 tbody {
                     (rows(t, &columns))
-                    tr class="sum" {
-                        th scope="row" { "Total" }
-                        @for (c, class) in &columns { td class=(class) { (total(*c)) } }
-                    }
-                    tr {
-                        th scope="row" { (term("iqm", "Interquartile mean")) }
-                        @for (c, class) in &columns { td class=(class) { (iqm(*c)) } }
-                    }
-                    @if t.paper.is_some_and(|p| p.rows.len() == t.rows.len()) {
-                        tr {
-                            th scope="row" { "as printed" }
-                            @for (c, class) in &columns {
-                                td class=(class) {
-                                    @if let Column::Paper(c) = *c { (papers[c].total.map_or("–".into(), one)) }
-                                }
-                            }
-                        }
-                    }
+                    (sums(t, &columns))
                 }
             }
         }
@@ -179,6 +137,53 @@ fn rows(t: &ShiftTable, columns: &[(Column, String)]) -> Markup {
                     }
                 }
             }
+        }
+    }
+}
+
+/// What the columns come to over the tasks.
+fn sums(t: &ShiftTable, columns: &[(Column, String)]) -> Markup {
+    let of = |n: usize| html! { @if n < t.rows.len() { br; small { "of " (counted(n, "task", "tasks")) } } };
+    let total = |c: Column| match c {
+        Column::Ours(m) => html! {
+            @match &t.totals[m] {
+                None => "–",
+                Some(Total { estimate, tasks }) => {
+                    (one(estimate.point)) br; small { (range(estimate.interval, 1)) } (of(*tasks))
+                }
+            }
+        },
+        Column::Paper(c) => match t.paper_totals[c] {
+            (_, 0) => html! { "–" },
+            (sum, n) => html! { (one(sum)) (of(n)) },
+        },
+    };
+    let iqm = |c: Column| match c {
+        Column::Ours(m) => html! {
+            @match &t.iqms[m] {
+                None => "–",
+                Some(Total { estimate, .. }) => { (one(estimate.point)) br; small { (range(estimate.interval, 1)) } }
+            }
+        },
+        // The paper does not print single runs.
+        Column::Paper(_) => html! { "–" },
+    };
+    html! {
+        tr class="sum" {
+            th scope="row" { "Total" }
+            @for (c, class) in columns { td class=(class) { (total(*c)) } }
+        }
+        @if let Some(paper) = t.paper.filter(|p| p.rows.len() == t.rows.len()) {
+            tr {
+                th scope="row" { "as printed" }
+                @for (c, class) in columns {
+                    td class=(class) { @if let Column::Paper(c) = *c { (paper.columns[c].total.map_or("–".into(), one)) } }
+                }
+            }
+        }
+        tr {
+            th scope="row" { (term("iqm", "Interquartile mean")) }
+            @for (c, class) in columns { td class=(class) { (iqm(*c)) } }
         }
     }
 }

@@ -165,7 +165,13 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("every network that the training kept", "tce diagnose generator 'hopper-morph:medium->expert' --cycles"),
         ],
     ),
-    ("sweep plan", &[("from a description to a list of work", "tce sweep plan examples/sweep.toml")]),
+    (
+        "sweep plan",
+        &[
+            ("from a description to a list of work", "tce sweep plan examples/sweep.toml"),
+            ("the paper's table, and what it would cost", "tce sweep plan examples/table.toml --dry-run --estimate"),
+        ],
+    ),
     (
         "sweep launch",
         &[
@@ -177,10 +183,15 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     ("sweep status", &[("again and again, until all is done", "tce sweep status runs/sweeps/sweep --watch")]),
     ("sweep gather", &[("verify all files, and make the table", "tce sweep gather runs/sweeps/sweep")]),
     (
+        "sweep export",
+        &[("what a sweep found, as one small file", "tce sweep export runs/sweeps/sweep --out results/mine.jsonl")],
+    ),
+    (
         "report",
         &[
             ("a page beside the sweep", "tce report runs/sweeps/sweep"),
             ("of runs of `tce run`, elsewhere", "tce report runs --out page"),
+            ("records and a sweep as one", "tce report bench/results runs/sweeps/sweep --out page"),
         ],
     ),
     ("bench", &[("everything", "tce bench"), ("one loop, longer", "tce bench iql --repeats 11 --seconds 2")]),
