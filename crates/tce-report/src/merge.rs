@@ -8,50 +8,45 @@ use crate::folder::{RunFolder, Verdict};
 use crate::study::{Method, Missing, Run, Study};
 
 /// All of `studies` as one, in their order. A run that several of them have counts once. Where they differ about a run of the same
-/// settings and data, the first one counts, and the difference is a conflict. Settings that share a name, a task and a seed become
-/// columns of their own.
+/// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings or data for a method,
+/// task and seed, each of them has a column of its own.
 ///
 /// # Panics
 /// If there is none.
 pub fn merge(studies: Vec<Study>) -> Study {
     let alone = studies.len() == 1;
     let mut studies = studies.into_iter();
-    let mut out = studies.next().expect("at least one study");
+    let first = studies.next().expect("at least one study");
     if alone {
-        return out;
+        return first;
     }
-    for study in studies {
-        join(&mut out, study);
-    }
+    let mut merging = Merging {
+        names: vec![first.name.clone()],
+        origins: vec![0; first.runs.len()],
+        renamed: Vec::new(),
+        out: first,
+    };
+    studies.for_each(|study| merging.join(study));
+    merging.split();
+    let mut out = merging.out;
     // What one of them lacks another one may have.
     let done =
         |m: &Missing| out.runs.iter().any(|r| (r.task, &r.method, Some(r.member.seed)) == (m.task, &m.method, m.seed));
     let missing = std::mem::take(&mut out.missing);
     out.missing = missing.into_iter().filter(|m| !done(m)).collect();
-    let runs: Vec<_> = out.runs.iter().map(|r| (r.task, r.method.as_str(), &*r.folder, r.member.seed)).collect();
-    let (ids, notes) = columns(&runs);
-    let mut split = BTreeSet::new();
-    for (run, id) in out.runs.iter_mut().zip(ids).filter(|(run, id)| run.method != *id) {
-        split.insert(run.method.clone());
-        if !out.methods.iter().any(|m| m.id == id) {
-            let of = out.methods.iter().position(|m| m.id == run.method).expect("every run has a method");
-            let mark = &id[run.method.len()..];
-            let method = &out.methods[of];
-            let title = format!("{},{mark}", method.title);
-            let method = Method { id: id.clone(), title, plain: false, ..method.clone() };
-            // Behind the columns that came from the same one before.
-            let behind =
-                out.methods[of + 1..].iter().take_while(|m| m.id.starts_with(&format!("{} ", run.method))).count();
-            out.methods.insert(of + 1 + behind, method);
-        }
-        run.method = id;
-    }
-    // A baseline keeps its column without runs: a table shows that it lacks it.
-    let used = |id: &str| out.runs.iter().any(|r| r.method == id) || out.missing.iter().any(|r| r.method == id);
-    out.methods.retain(|m| used(&m.id) || (m.baseline && !split.contains(&m.id)));
     out.methods.sort_by_key(|m| !m.baseline);
-    add_new(&mut out.notes, notes);
     out
+}
+
+/// Studies on their way into one.
+struct Merging {
+    out: Study,
+    /// The study that each run of `out` came from.
+    origins: Vec<usize>,
+    /// The studies' names, each once.
+    names: Vec<String>,
+    /// Methods that have another id than in their study, because that was taken: as they were, and the new id.
+    renamed: Vec<(Method, String)>,
 }
 
 /// What makes two runs the same work.
@@ -60,58 +55,125 @@ fn same_work(a: &Run, b: &Run) -> bool {
         && (&a.folder.config_hash, &a.folder.inputs) == (&b.folder.config_hash, &b.folder.inputs)
 }
 
-/// What makes two results the same: one result has many times and places.
-fn same_result(a: &Run, b: &Run) -> bool {
-    let bits = |r: &Run| match &r.member.verdict {
-        Verdict::Score(score) => Some(score.to_bits()),
-        Verdict::Diverged(_) | Verdict::Unscored => None,
-    };
-    bits(a) == bits(b)
+/// The column of `method` for the runs of the study `name`.
+fn of_study(method: &Method, name: &str) -> Method {
+    let named = |text: &str| format!("{text} ({name})");
+    Method { id: named(&method.id), title: named(&method.title), plain: false, ..method.clone() }
 }
 
-fn join(out: &mut Study, other: Study) {
-    let name = format!("{} + {}", out.name, other.name);
-    // The name is a heading: three names are enough for one.
-    out.name =
-        if name.matches(" + ").count() < 3 { name } else { format!("{} + …", out.name.trim_end_matches(" + …")) };
-    out.directory = format!("{}, {}", out.directory, other.directory);
-    out.sweep |= other.sweep;
-    let mut renamed = BTreeMap::new();
-    for method in other.methods {
-        match out.methods.iter().find(|m| m.id == method.id) {
-            None => out.methods.push(method),
-            Some(known) if *known == method => {}
-            Some(_) => {
-                // The same name for something else.
-                let id = format!("{} ({})", method.id, other.name);
-                renamed.insert(method.id.clone(), id.clone());
-                let title = format!("{} ({})", method.title, other.name);
-                out.methods.push(Method { id, title, plain: false, ..method });
+impl Merging {
+    /// The id that a method of the study `name` has from now on.
+    fn id(&mut self, method: Method, name: &str) -> String {
+        match self.out.methods.iter().find(|m| m.id == method.id) {
+            Some(known) if *known == method => method.id,
+            Some(_) => match self.renamed.iter().find(|(original, _)| *original == method) {
+                Some((_, id)) => id.clone(),
+                None => {
+                    // The same name for something else.
+                    let new = of_study(&method, name);
+                    let id = new.id.clone();
+                    self.renamed.push((method, id.clone()));
+                    self.out.methods.push(new);
+                    id
+                }
+            },
+            None => {
+                let id = method.id.clone();
+                self.out.methods.push(method);
+                id
             }
         }
     }
-    let of = |id: String| renamed.get(&id).cloned().unwrap_or(id);
-    for run in other.runs {
-        let run = Run { method: of(run.method), ..run };
-        match out.runs.iter().find(|r| same_work(r, &run)) {
-            Some(first) if same_result(first, &run) => {}
-            Some(first) => {
-                let of = |r: &Run| format!("{} on {}", r.folder.directory.display(), r.folder.machine);
+
+    fn join(&mut self, other: Study) {
+        let number = self.names.len();
+        let mut name = other.name.clone();
+        while self.names.contains(&name) {
+            name += "'";
+        }
+        self.names.push(name.clone());
+        let ids: BTreeMap<String, String> =
+            other.methods.into_iter().map(|m| (m.id.clone(), self.id(m, &name))).collect();
+        let of = |id: String| ids.get(&id).cloned().unwrap_or(id);
+        for run in other.runs {
+            self.add(Run { method: of(run.method), ..run }, number);
+        }
+        let out = &mut self.out;
+        // The name is a heading: some names are enough for one.
+        if number < 3 {
+            out.name = format!("{} + {}", out.name, other.name);
+        } else if !out.name.ends_with(" + …") {
+            out.name += " + …";
+        }
+        out.directory = format!("{}, {}", out.directory, other.directory);
+        out.sweep |= other.sweep;
+        add_new(&mut out.notes, other.notes);
+        add_new(&mut out.conflicts, other.conflicts);
+        add_new(&mut out.missing, other.missing.into_iter().map(|m| Missing { method: of(m.method), ..m }));
+        add_new(&mut out.recommended, other.recommended);
+        out.costs.extend(other.costs);
+        out.diagnoses.extend(other.diagnoses);
+    }
+
+    /// Adds a run of study `number`, unless it is there.
+    fn add(&mut self, run: Run, number: usize) {
+        let Some(at) = self.out.runs.iter().position(|r| same_work(r, &run)) else {
+            self.out.runs.push(run);
+            self.origins.push(number);
+            return;
+        };
+        let first = &self.out.runs[at];
+        match (&first.member.verdict, &run.member.verdict) {
+            (_, Verdict::Unscored) => {}
+            // Somebody looked since.
+            (Verdict::Unscored, _) => (self.out.runs[at], self.origins[at]) = (run, number),
+            (a, b) if a == b => {}
+            (a, b) => {
+                let told = |r: &Run, verdict: &Verdict| {
+                    let came_to = match verdict {
+                        Verdict::Score(score) => format!("{score:.1}"),
+                        Verdict::Diverged(_) | Verdict::Unscored => "diverged".to_owned(),
+                    };
+                    format!("{came_to} ({}, {}, {})", r.folder.directory.display(), r.folder.program, r.folder.machine)
+                };
+                let (task, seed) = (run.task, run.member.seed);
                 let conflict =
-                    format!("{}, {}, seed {}: {}, and {}", run.method, run.task, run.member.seed, of(first), of(&run));
-                out.conflicts.push(conflict);
+                    format!("{}, {task}, seed {seed}: {}, and {}", run.method, told(first, a), told(&run, b));
+                self.out.conflicts.push(conflict);
             }
-            None => out.runs.push(run),
         }
     }
-    let new =
-        |known: &[String], notes: Vec<String>| notes.into_iter().filter(|n| !known.contains(n)).collect::<Vec<_>>();
-    out.notes.extend(new(&out.notes, other.notes));
-    out.conflicts.extend(new(&out.conflicts, other.conflicts));
-    add_new(&mut out.missing, other.missing.into_iter().map(|m| Missing { method: of(m.method), ..m }));
-    out.costs.extend(other.costs);
-    out.diagnoses.extend(other.diagnoses);
-    add_new(&mut out.recommended, other.recommended);
+
+    /// Gives every study a column of its own where several have runs of one method, task and seed that are different work.
+    fn split(&mut self) {
+        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
+        let twice: BTreeSet<String> = (self.out.runs.iter())
+            .filter(|r| !seen.insert((r.task, &r.method, r.member.seed)))
+            .map(|r| r.method.clone())
+            .collect();
+        for id in twice {
+            let at = self.out.methods.iter().position(|m| m.id == id).expect("every run has a method");
+            let method = self.out.methods.remove(at);
+            let mut columns = 0;
+            for (number, name) in self.names.iter().enumerate() {
+                let own = of_study(&method, name);
+                let runs = self
+                    .out
+                    .runs
+                    .iter_mut()
+                    .zip(&self.origins)
+                    .filter(|(r, origin)| r.method == id && **origin == number);
+                let count = runs.map(|(run, _)| run.method.clone_from(&own.id)).count();
+                if count > 0 {
+                    self.out.methods.insert(at + columns, own);
+                    columns += 1;
+                }
+            }
+            let note =
+                format!("{id}: several studies have it with different settings or data; each is a column of its own.");
+            add_new(&mut self.out.notes, [note]);
+        }
+    }
 }
 
 /// Those of `more` that `known` does not have yet.
@@ -124,8 +186,8 @@ fn add_new<T: PartialEq>(known: &mut Vec<T>, more: impl IntoIterator<Item = T>) 
 }
 
 /// The column of every run, given as task, name, folder and seed: its name. Where a task has two runs of one name and seed, they differ in
-/// their settings or their data, and every setting, or else every folder, of that name is a column of its own. The second list tells
-/// a reader which names that befell.
+/// their settings or their data, and every setting, or else every folder, of that name is a column of its own. The second list has a note
+/// for a reader on every such name.
 pub fn columns(runs: &[(Task, &str, &RunFolder, u64)]) -> (Vec<String>, Vec<String>) {
     let mut ids: Vec<String> = runs.iter().map(|r| r.1.to_owned()).collect();
     let mut notes = Vec::new();

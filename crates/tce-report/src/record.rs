@@ -5,7 +5,7 @@
 //!
 //! | key | content |
 //! |---|---|
-//! | `record` | first line: version of the format, the study's name, the program that wrote it |
+//! | `record` | first line: version of the format, the study's name, the program that wrote it, whether it was a sweep |
 //! | `method` | a column of the tables |
 //! | `config` | a configuration as TOML, and its hash |
 //! | `run` | a finished run: task, method, recipe, and all that [`RunFolder`] holds but configuration and curves |
@@ -14,7 +14,9 @@
 //! Lines have a fixed order, so that a record that gains runs changes by added lines.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -34,7 +36,7 @@ const AGAIN: &str = "write the record again with `tce sweep export`, or take it 
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Line {
-    Record { format: u32, name: String, program: String },
+    Record { format: u32, name: String, program: String, sweep: bool },
     Method(Method),
     Config { hash: String, toml: String },
     Run { task: Task, method: String, recipe: Recipe, folder: Box<RunFolder> },
@@ -59,34 +61,47 @@ struct AnyHeader {
 
 /// Whether the file at `path` begins as a record does.
 pub fn is_record(path: &Path) -> bool {
-    let first = |text: Vec<u8>| {
-        let line = text.split(|b| *b == b'\n').next().unwrap_or_default();
-        serde_json::from_slice::<AnyRecord>(line).is_ok()
-    };
-    path.is_file() && read_if_there(path).ok().flatten().is_some_and(first)
+    let mut first = Vec::new();
+    // The first line is short; another file may have no line break at all.
+    let head = File::open(path).and_then(|file| BufReader::new(file.take(1 << 16)).read_until(b'\n', &mut first));
+    head.is_ok() && serde_json::from_slice::<AnyRecord>(&first).is_ok()
 }
 
-/// The record of `study`, as text. Folders are named relative to the study's.
+/// The record of `study`, as text. Of a run's folder only the name is kept.
 pub fn to_text(study: &Study) -> String {
-    let mut lines = vec![Line::Record { format: FORMAT, name: study.name.clone(), program: PROGRAM.into() }];
-    let used =
-        |m: &&Method| study.runs.iter().any(|r| r.method == m.id) || study.missing.iter().any(|r| r.method == m.id);
+    let header = Line::Record { format: FORMAT, name: study.name.clone(), program: PROGRAM.into(), sweep: study.sweep };
+    let mut lines = vec![header];
+    let used = |m: &&Method| {
+        m.baseline || study.runs.iter().any(|r| r.method == m.id) || study.missing.iter().any(|r| r.method == m.id)
+    };
     lines.extend(study.methods.iter().filter(used).cloned().map(Line::Method));
     let configs: BTreeMap<&str, &str> =
         study.runs.iter().map(|r| (r.folder.config_hash.as_str(), r.folder.config.as_str())).collect();
     lines.extend(configs.into_iter().map(|(hash, toml)| Line::Config { hash: hash.into(), toml: toml.into() }));
-    // The first member of each folder stands for all of them.
-    let mut runs: Vec<&Run> = study.runs.iter().filter(|r| r.index == 0).collect();
-    runs.sort_by_key(|r| (order(&r.task), r.method.clone(), r.member.seed, r.folder.config_hash.clone()));
-    lines.extend(runs.into_iter().map(|run| {
-        let folder = RunFolder { curves: Vec::new(), ..(*run.folder).clone() };
-        let directory = folder.directory.strip_prefix(&study.directory).unwrap_or(&folder.directory).to_owned();
-        Line::Run {
-            task: run.task,
-            method: run.method.clone(),
-            recipe: (*run.recipe).clone(),
-            folder: Box::new(RunFolder { directory, ..folder }),
+    // One line a folder, with those of its members that the study has.
+    let mut folders: Vec<Vec<&Run>> = Vec::new();
+    for run in &study.runs {
+        let same = |group: &&mut Vec<&Run>| {
+            let first = group[0];
+            Arc::ptr_eq(&first.folder, &run.folder) && (first.task, &first.method) == (run.task, &run.method)
+        };
+        match folders.iter_mut().find(same) {
+            Some(group) => group.push(run),
+            None => folders.push(vec![run]),
         }
+    }
+    folders.sort_by_key(|group| {
+        let first = group[0];
+        (order(&first.task), first.method.clone(), first.member.seed, first.folder.config_hash.clone())
+    });
+    lines.extend(folders.into_iter().map(|group| {
+        let first = group[0];
+        let name = first.folder.directory.file_name().map_or_else(PathBuf::new, PathBuf::from);
+        let generated = group.iter().filter_map(|r| r.folder.generated.get(r.index).copied()).collect();
+        let members = group.iter().map(|r| r.member.clone()).collect();
+        let folder = RunFolder { directory: name, members, generated, curves: Vec::new(), ..(*first.folder).clone() };
+        let (method, recipe) = (first.method.clone(), (*first.recipe).clone());
+        Line::Run { task: first.task, method, recipe, folder: Box::new(folder) }
     }));
     lines.extend(study.recommended.iter().cloned().map(Line::Recommended));
     lines.extend(study.missing.iter().cloned().map(Line::Missing));
@@ -131,13 +146,20 @@ pub fn read(path: &Path) -> Result<Study> {
     let parse = |n: usize, line: &str| {
         serde_json::from_str::<Line>(line).map_err(|e| wrong(n, e.to_string(), "a line of a record"))
     };
-    let Line::Record { name, .. } = parse(1, first)? else { unreachable!("it was read as a header") };
-    let mut study = Study::new(name, path.display().to_string());
+    let mut study = Study::new(String::new(), path.display().to_string());
+    if let Line::Record { name, sweep, .. } = parse(1, first)? {
+        (study.name, study.sweep) = (name, sweep);
+    }
     let mut configs = BTreeMap::new();
     for (n, line) in lines {
         match parse(n, line)? {
             Line::Record { .. } => return Err(wrong(n, "a second header".into(), "one header, in the first line")),
-            Line::Method(method) => study.methods.push(method),
+            Line::Method(method) => {
+                if study.methods.iter().any(|m| m.id == method.id) {
+                    return Err(wrong(n, format!("a second method {:?}", method.id), "every method once"));
+                }
+                study.methods.push(method);
+            }
             Line::Config { hash, toml } => {
                 if config_hash(&toml) != hash {
                     return Err(wrong(
@@ -157,7 +179,16 @@ pub fn read(path: &Path) -> Result<Study> {
                 if !study.methods.iter().any(|m| m.id == method) {
                     return Err(wrong(n, format!("method {method:?}"), "a `method` line of this id before the run"));
                 }
-                study.add(task, &method, RunFolder { config, ..*folder }, &Arc::new(recipe));
+                let folder = RunFolder { config, ..*folder };
+                let twice = folder.members.iter().find(|member| {
+                    let same = |r: &&Run| (r.task, &r.method, r.member.seed) == (task, &method, member.seed);
+                    study.runs.iter().any(|r| same(&r))
+                });
+                if let Some(member) = twice {
+                    let found = format!("a second run of {method}, {task}, seed {}", member.seed);
+                    return Err(wrong(n, found, "one run for every method, task and seed"));
+                }
+                study.add(task, &method, folder, &Arc::new(recipe));
             }
             Line::Missing(missing) => study.missing.push(missing),
             Line::Conflict(conflict) => study.conflicts.push(conflict),

@@ -120,9 +120,9 @@ pub struct Recommended {
     pub method: String,
     /// Whether the recommendation was sure of itself.
     pub sure: bool,
-    /// Whether it was one among policies of its seed alone.
-    #[serde(default)]
-    pub one_seed: bool,
+    /// The folders of the runs that it chose among; empty: all of the task's.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub among: Vec<String>,
 }
 
 /// One policy and its score.

@@ -18,7 +18,6 @@ use crate::diagnosis;
 use crate::error::{Error, Result};
 use crate::recipe::Recipes;
 use crate::sweep::gather::Checked;
-use crate::sweep::work::VERDICT;
 use crate::sweep::{Entry, Kind, Sweep};
 use crate::variant::Variant;
 
@@ -34,7 +33,8 @@ pub fn of_places(places: &[PathBuf]) -> Result<Study> {
             continue;
         }
         let records = records(place)?;
-        if records.is_empty() {
+        // A folder may hold both.
+        if records.is_empty() || (place.is_dir() && directories(place)?.iter().any(|d| task_of(d).is_some())) {
             studies.push(of_runs(place)?);
         }
         for path in records {
@@ -44,13 +44,14 @@ pub fn of_places(places: &[PathBuf]) -> Result<Study> {
     Ok(merge(studies))
 }
 
-/// The records at `place`: the file itself, or those that lie in the folder.
+/// The records at `place`: the file itself, or all `*.jsonl` of a folder.
 fn records(place: &Path) -> Result<Vec<PathBuf>> {
     if place.is_file() {
         // Whatever else it is, the reader of records says.
         return Ok(vec![place.to_owned()]);
     }
-    let mut found: Vec<PathBuf> = entries(place)?.into_iter().filter(|p| record::is_record(p)).collect();
+    let mut found: Vec<PathBuf> = entries(place)?;
+    found.retain(|p| p.extension().is_some_and(|e| e == "jsonl") && !name_of(p).starts_with('.'));
     found.sort();
     Ok(found)
 }
@@ -110,7 +111,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     }
     let mut notes = Vec::new();
     let diagnoses = diagnoses(&sweep.directory.join("runs"), &mut notes);
-    let recommended = recommended(&sweep.directory.join("runs"), &mut notes);
+    let recommended = verdicts(sweep, &mut notes);
     let mut recipes = Recipes::default();
     let mut study = Study {
         sweep: true,
@@ -361,31 +362,54 @@ fn diagnoses(root: &Path, notes: &mut Vec<String>) -> Vec<Diagnosis> {
 /// What `tce run` recommended for the tasks under `root`.
 fn recommended(root: &Path, notes: &mut Vec<String>) -> Vec<Recommended> {
     let mut out = Vec::new();
-    let mut found: Vec<(Task, PathBuf, bool)> = Vec::new();
     for place in directories(root).unwrap_or_default() {
-        let Some(task) = task_of(&place) else { continue };
-        found.push((task, place.join("verdict.json"), false));
-        // Of a sweep, which recommends seed by seed.
-        let own = directories(&place).unwrap_or_default().into_iter().filter(|p| name_of(p).starts_with(VERDICT));
-        found.extend(own.map(|p| (task, p.join("verdict.json"), true)));
+        if let Some(task) = task_of(&place) {
+            out.extend(verdict_of(task, &place.join("verdict.json"), Vec::new(), notes));
+        }
     }
-    for (task, path, one_seed) in found.into_iter().filter(|(_, path, _)| path.exists()) {
-        let verdict = json(&path).unwrap_or_default();
-        let (Some(method), Some(policy)) = (verdict["method"].as_str(), verdict["policy"].as_str()) else {
-            notes.push(format!("A recommendation is left out: {} names no method and policy.", path.display()));
+    out
+}
+
+/// The verdict in the file at `path` on the runs in the folders `among`; None without a file.
+fn verdict_of(task: Task, path: &Path, among: Vec<String>, notes: &mut Vec<String>) -> Option<Recommended> {
+    if !path.exists() {
+        return None;
+    }
+    let verdict = json(path).unwrap_or_default();
+    let (Some(method), Some(policy)) = (verdict["method"].as_str(), verdict["policy"].as_str()) else {
+        notes.push(format!("A recommendation is left out: {} names no method and policy.", path.display()));
+        return None;
+    };
+    // RUN/policy-seedN.safetensors
+    let policy = Path::new(policy);
+    let seed = policy.file_stem().and_then(|n| n.to_str()?.strip_prefix("policy-seed")?.parse().ok());
+    Some(Recommended {
+        task,
+        folder: policy.parent().map(name_of),
+        seed,
+        method: method.to_owned(),
+        sure: verdict["sure"].as_bool().unwrap_or(false),
+        among,
+    })
+}
+
+/// The verdicts of a sweep, whose files are what their records say; a verdict that is missing is a note.
+fn verdicts(sweep: &Sweep, notes: &mut Vec<String>) -> Vec<Recommended> {
+    let mut out = Vec::new();
+    let mut missing = 0;
+    for entry in sweep.entries().iter().filter(|e| e.kind == Kind::Verdict) {
+        let Checked::Done(outcome) = sweep.check(entry) else {
+            missing += 1;
             continue;
         };
-        // RUN/policy-seedN.safetensors
-        let policy = Path::new(policy);
-        let seed = policy.file_stem().and_then(|n| n.to_str()?.strip_prefix("policy-seed")?.parse().ok());
-        out.push(Recommended {
-            task,
-            folder: policy.parent().map(name_of),
-            seed,
-            method: method.to_owned(),
-            sure: verdict["sure"].as_bool().unwrap_or(false),
-            one_seed,
-        });
+        let run = |n: &usize| Some(name_of(&sweep.outcome(&sweep.entries()[*n]).ok()??.place));
+        let among = entry.needs.iter().filter_map(run).collect();
+        out.extend(verdict_of(entry.task, &sweep.directory.join(outcome.place).join("verdict.json"), among, notes));
+    }
+    if missing > 0 {
+        notes.push(format!(
+            "Recommendations of {missing} tasks and seeds are not made yet, or their files were changed."
+        ));
     }
     out
 }

@@ -30,7 +30,7 @@ pub struct Recommendation {
     pub sure: bool,
     /// What the policy scores; None if its run is not here, or has no score.
     pub score: Option<f64>,
-    /// The policy with the highest score of all that the report has for the task, or for its seed where it was one of these.
+    /// The policy with the highest score of all that the report has for the task, or of those that it was chosen among.
     pub best: Option<Scored>,
 }
 
@@ -45,12 +45,12 @@ impl Recommendation {
 pub fn recommendations(study: &Study) -> Vec<Recommendation> {
     let title = |run: &Run| study.methods.iter().find(|m| m.id == run.method).map_or(&run.method, |m| &m.title).clone();
     let of = |r: &Recommended| {
-        // Of a verdict on one seed's policies the others are no rivals.
-        let candidate = |run: &&Run| run.task == r.task && (!r.one_seed || r.seed == Some(run.member.seed));
+        let name = |run: &Run| run.folder.directory.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_owned();
+        // What it did not choose among is no alternative to it.
+        let candidate = |run: &&Run| run.task == r.task && (r.among.is_empty() || r.among.contains(&name(run)));
         let runs = || study.runs.iter().filter(candidate);
         let is = |run: &&Run| {
-            let name = run.folder.directory.file_name().and_then(|n| n.to_str());
-            r.folder.is_some() && name == r.folder.as_deref() && r.seed == Some(run.member.seed)
+            r.folder.as_deref().is_some_and(|folder| folder == name(run)) && r.seed == Some(run.member.seed)
         };
         let scored =
             runs().filter_map(|run| Some(Scored { method: title(run), seed: run.member.seed, score: score(run)? }));

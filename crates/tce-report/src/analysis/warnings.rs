@@ -62,7 +62,8 @@ fn of_runs(study: &Study, out: &mut Vec<Warning>) {
     }
     if !study.conflicts.is_empty() {
         warn(out,
-            "Two copies of the same work came to different results; the first one is shown. This is a fault of determinism."
+            "Two copies of the same work came to different results; the first one is shown. This is a fault of determinism, unless they were \
+             done on different processors or by different versions of the program."
                 .into(),
             study.conflicts.clone(),
         );

@@ -24,7 +24,7 @@ pub(super) fn runs(study: &Study) -> Markup {
         p {
             "Every score with what decided it: seed, settings, hashes of data and results, and the program. The runs lie in "
             code { (study.directory) } ". The call that makes a run again stands beside its hashes: on the same data, a processor with the same \
-             instructions and the same version of the program, it gives the same policy byte for byte."
+             instructions and the same version of the program, it gives the same policy byte for byte if no GPU was used."
         }
         @for task in &tasks {
             @let list: Vec<&Run> = study.methods.iter().flat_map(|m| study.runs.iter().filter(move |r| r.task == *task && r.method == m.id)).collect();

@@ -63,13 +63,40 @@ fn runs_that_two_records_have_count_once() {
     add(&mut later, hopper(), "tce-og", &directory);
     let both = merge(vec![record, later]);
     assert_eq!((both.runs.len(), both.missing.len(), both.conflicts.len()), (7, 0, 1), "{:?}", both.conflicts);
-    assert!(both.conflicts[0].starts_with("bc, hopper-morph/medium/expert, seed 2: bc on "), "{:?}", both.conflicts);
+    assert!(
+        both.conflicts[0].starts_with("bc, hopper-morph/medium/expert, seed 2: 72.0 (bc, tce 0.1.0, ), and 73.0 ("),
+        "{:?}",
+        both.conflicts
+    );
     let first: Vec<f64> = both
         .runs
         .iter()
         .filter_map(|r| if let Verdict::Score(s) = r.member.verdict { Some(s) } else { None })
         .collect();
     assert_eq!(first, [70.0, 71.0, 72.0, 80.0, 81.0, 82.5, 85.0]);
+}
+
+/// Of a folder with three members a merge may keep two; its record has these.
+#[test]
+fn a_record_of_a_merge_has_every_run_once() {
+    let root = tempfile::tempdir().unwrap();
+    let mut one = one_task(root.path(), &[("bc", "BC", &[70.0])]);
+    one.name = "one".into();
+    let three = one_task(&root.path().join("b"), &[("bc", "BC", &[70.0, 71.0, 72.0])]);
+    let both = merge(vec![one, three]);
+    let again = read_again(&both, &root.path().join("both.jsonl"));
+    let scores = |s: &Study| s.runs.iter().map(|r| (r.member.seed, r.member.verdict.clone())).collect::<Vec<_>>();
+    assert_eq!(
+        scores(&again),
+        [70.0, 71.0, 72.0].iter().zip(0..).map(|(s, k)| (k, Verdict::Score(*s))).collect::<Vec<_>>()
+    );
+    // A run that is there twice would count as two seeds.
+    let text = record::to_text(&both);
+    let run = text.lines().find(|l| l.starts_with("{\"run\"")).unwrap();
+    let path = root.path().join("twice.jsonl");
+    fs::write(&path, format!("{text}{run}\n")).unwrap();
+    let error = record::read(&path).unwrap_err().to_string();
+    assert!(error.contains("a second run of bc, hopper-morph/medium/expert, seed 0"), "{error}");
 }
 
 #[test]
@@ -84,14 +111,15 @@ fn other_settings_and_other_methods_of_one_name_are_columns_of_their_own() {
         write_folder(&directory, &[(0, Some(50.0))], "a = 2\n");
         add(&mut other, hopper(), id, &directory);
     }
-    let both = merge(vec![first, other]);
-    let ids: Vec<&str> = both.methods.iter().map(|m| m.id.as_str()).collect();
-    let hash = |k: usize| both.runs[k].folder.config_hash[..6].to_owned();
-    let (own, others) = (format!("bc {}", hash(0)), format!("bc {}", hash(6)));
-    assert_ne!(own, others);
-    assert_eq!(ids, [own.as_str(), others.as_str(), "tce-og", "tce-og (mine)"]);
-    assert_eq!(both.runs[7].method, "tce-og (mine)");
-    assert!(both.notes[0].starts_with("bc: a task has several runs of one seed"), "{:?}", both.notes);
+    let both = merge(vec![first.clone(), other.clone()]);
+    let ids = |study: &Study| study.methods.iter().map(|m| m.id.clone()).collect::<Vec<_>>();
+    assert_eq!(ids(&both), ["bc (demo)", "bc (mine)", "tce-og", "tce-og (mine)"]);
+    assert_eq!((both.runs[6].method.as_str(), both.runs[7].method.as_str()), ("bc (mine)", "tce-og (mine)"));
+    assert!(both.notes[0].starts_with("bc: several studies have it"), "{:?}", both.notes);
+    // The record of a study beside it changes nothing.
+    let record = read_again(&other, &root.path().join("mine.jsonl"));
+    let three = merge(vec![first, other, record]);
+    assert_eq!((ids(&three), three.runs.len()), (ids(&both), both.runs.len()));
 }
 
 #[test]

@@ -86,7 +86,7 @@ fn recommended(folder: &str, seed: u64, sure: bool) -> Recommended {
         seed: Some(seed),
         method: "as it was called".into(),
         sure,
-        one_seed: false,
+        among: Vec::new(),
     }
 }
 

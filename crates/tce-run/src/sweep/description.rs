@@ -45,7 +45,8 @@ pub struct Description {
     /// What becomes of tasks whose data cannot be had.
     #[serde(default)]
     pub unavailable: Unavailable,
-    /// Whether the program recommends a policy for every task and seed, from the data alone, as `tce run` does.
+    /// Whether the program recommends a policy for every task and seed, from the data alone, as `tce run` does. It chooses in the first tier by
+    /// whose end there are a baseline and a method.
     #[serde(default)]
     pub verdicts: bool,
     /// Data files of a task, relative to the description.
@@ -66,7 +67,7 @@ pub enum Unavailable {
     /// Nothing is planned.
     #[default]
     Refuse,
-    /// They are left out, and named.
+    /// They are left out, with all their runs, and named.
     Skip,
 }
 
@@ -150,14 +151,23 @@ impl Description {
         };
         let tiers = if self.tiers.is_empty() { std::slice::from_ref(&whole) } else { &self.tiers[..] };
         let mut names = BTreeSet::new();
+        let mut columns: BTreeMap<String, Vec<String>> = BTreeMap::new();
         let mut runs = 0u64;
         let mut parts = Vec::new();
         for tier in tiers {
             let within = |e: String| if tier.name.is_empty() { e } else { format!("tier {:?}: {e}", tier.name) };
             if !names.insert(&tier.name) || (tier.name.is_empty() && !self.tiers.is_empty()) {
-                return Err(format!("tiers: found the name {:?}, expected one of its own for every tier", tier.name));
+                return Err(format!("tiers: found the name {:?}, expected a different name for every tier", tier.name));
             }
             let part = self.part(tier).map_err(within)?;
+            for Override { name, set } in &part.overrides {
+                if columns.entry(name.clone()).or_insert_with(|| set.clone()) != set {
+                    return Err(within(format!(
+                        "overrides: {name:?} sets {set:?} here and {:?} before; a name stands for one column, choose another one",
+                        columns[name]
+                    )));
+                }
+            }
             let pieces = [part.tasks.len(), part.variants.len(), part.overrides.len()].iter().product::<usize>() as u64;
             let seeds = part.seeds.end - part.seeds.start;
             runs = pieces.checked_mul(seeds).and_then(|n| runs.checked_add(n)).unwrap_or(u64::MAX);

@@ -122,6 +122,27 @@ impl Header {
     }
 }
 
+/// The policies that verdicts choose among, while a plan is made.
+#[derive(Default)]
+struct Verdicts {
+    /// The runs of a task and a seed so far, of all tiers.
+    policies: BTreeMap<(Task, u64), Vec<usize>>,
+    /// What has a verdict already.
+    given: BTreeSet<(Task, u64)>,
+}
+
+impl Verdicts {
+    /// Tasks and seeds that have a baseline and a method now, and had not before: what `tce run` chooses among.
+    fn ready(&mut self, entries: &[Entry]) -> Vec<(Task, u64, Vec<usize>)> {
+        let baseline = |run: &usize| entries[*run].variant.is_some_and(|v| Variant::BASELINES.contains(&v));
+        let both = |runs: &[usize]| runs.iter().any(baseline) && !runs.iter().all(baseline);
+        let ready = self.policies.iter().filter(|(key, runs)| !self.given.contains(key) && both(runs));
+        let ready: Vec<_> = ready.map(|(&(task, seed), runs)| (task, seed, runs.clone())).collect();
+        self.given.extend(ready.iter().map(|(task, seed, _)| (*task, *seed)));
+        ready
+    }
+}
+
 /// The list of work of a sweep.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Manifest {
@@ -164,31 +185,41 @@ impl Manifest {
             configs: BTreeMap::new(),
             entries: 0,
         };
-        let mut plan = Self { header, entries: Vec::new() };
-        let mut known = BTreeMap::new();
-        // Why the data of a task cannot be had, with as many source rows, or without a source.
+        // The runs of every part: task, variant, column and configuration. They are known before the first one is added, because a task
+        // whose data cannot be had for one of them is left out as a whole.
+        let mut runs = Vec::new();
         let mut lacking: BTreeMap<(Task, Option<usize>), Option<String>> = BTreeMap::new();
         for part in &parts {
-            let mut runs: BTreeMap<(Task, u64), Vec<usize>> = BTreeMap::new();
+            let mut own = Vec::new();
             for (&task, &variant) in part.tasks.iter().flat_map(|t| part.variants.iter().map(move |v| (t, v))) {
                 for Override { name, set } in &part.overrides {
                     let sets = [description.set.clone(), set.clone()].concat();
                     let layered = Layered::new(description.preset, Some(task), Some(variant), file.as_deref(), &sets)?;
                     let config = layered.config()?;
                     let rows = config.needs_source().then_some(config.source.rows);
-                    let lacks = || ensure_data(task, &plan.header.data_of(task), rows).err().map(|e| e.to_string());
-                    if lacking.entry((task, rows)).or_insert_with(lacks).is_some() {
-                        continue;
-                    }
-                    for seed in part.seeds.clone() {
-                        let run = plan.add_run(&mut known, &part.name, (task, variant, name), &config, seed);
-                        runs.entry((task, seed)).or_default().push(run);
-                    }
+                    let lacks = || ensure_data(task, &header.data_of(task), rows).err().map(|e| e.to_string());
+                    lacking.entry((task, rows)).or_insert_with(lacks);
+                    own.push((task, variant, name.as_str(), config));
+                }
+            }
+            runs.push(own);
+        }
+        let without: BTreeSet<Task> =
+            lacking.iter().filter(|(_, why)| why.is_some()).map(|((task, _), _)| *task).collect();
+        let mut plan = Self { header, entries: Vec::new() };
+        let mut known = BTreeMap::new();
+        let mut verdicts = Verdicts::default();
+        for (part, own) in parts.iter().zip(&runs) {
+            for (task, variant, label, config) in own.iter().filter(|r| !without.contains(&r.0)) {
+                for seed in part.seeds.clone() {
+                    let run = plan.add_run(&mut known, &part.name, (*task, *variant, label), config, seed);
+                    verdicts.policies.entry((*task, seed)).or_default().push(run);
                 }
             }
             if description.verdicts {
-                runs.into_iter()
-                    .for_each(|((task, seed), runs)| plan.add_verdict(&mut known, &part.name, task, seed, runs));
+                for (task, seed, runs) in verdicts.ready(&plan.entries) {
+                    plan.add_verdict(&mut known, &part.name, task, seed, runs);
+                }
             }
         }
         let lacking: BTreeSet<String> = lacking.into_values().flatten().collect();
@@ -197,7 +228,11 @@ impl Manifest {
             if description.unavailable == Unavailable::Refuse || plan.entries.is_empty() {
                 return Err(Error::Failed(format!("{}: not all data can be had:\n{list}", path.display())));
             }
-            tce_base::note!("left out, because their data cannot be had:\n{list}");
+            let tasks = without.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+            tce_base::note!(
+                "{} tasks are left out, because their data cannot be had ({tasks}):\n{list}",
+                without.len()
+            );
         }
         Ok(plan.sorted())
     }
@@ -299,7 +334,7 @@ impl Manifest {
     }
 
     /// Tiers one after the other, in each one seed after the other, and for each seed task after task with what its runs need: whoever stops
-    /// early has whole tasks.
+    /// early has whole tasks. What several pieces need stands before the first of them.
     fn sorted(mut self) -> Self {
         // Tiers and tasks have the order in which their first work was added.
         let (mut tiers, mut tasks): (BTreeMap<String, usize>, BTreeMap<Task, usize>) = Default::default();
@@ -308,11 +343,14 @@ impl Manifest {
             tiers.entry(entry.tier.clone()).or_insert(tier);
             tasks.entry(entry.task).or_insert(task);
         }
-        let mut order: Vec<usize> = (0..self.entries.len()).collect();
-        order.sort_by_key(|&i| {
+        let mut wanted: Vec<usize> = (0..self.entries.len()).collect();
+        wanted.sort_by_key(|&i| {
             let Entry { tier, seed, task, kind, .. } = &self.entries[i];
             (tiers[tier], *seed, tasks[task], *kind, i)
         });
+        let mut order = Vec::with_capacity(wanted.len());
+        let mut placed = vec![false; wanted.len()];
+        wanted.into_iter().for_each(|i| self.place(i, &mut placed, &mut order));
         let mut place = vec![0; order.len()];
         order.iter().enumerate().for_each(|(new, &old)| place[old] = new);
         let mut entries: Vec<Entry> = order.iter().map(|&i| self.entries[i].clone()).collect();
@@ -323,6 +361,14 @@ impl Manifest {
         self.header.entries = entries.len();
         self.entries = entries;
         self
+    }
+
+    /// Appends entry `i` to `order`, and before it what it needs, unless they are there.
+    fn place(&self, i: usize, placed: &mut [bool], order: &mut Vec<usize>) {
+        if !std::mem::replace(&mut placed[i], true) {
+            self.entries[i].needs.iter().for_each(|&n| self.place(n, placed, order));
+            order.push(i);
+        }
     }
 
     /// As `manifest.jsonl` has it.

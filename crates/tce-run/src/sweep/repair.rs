@@ -2,6 +2,7 @@
 //!
 //! Nothing is removed. The record and the files are renamed to `.NAME.damaged-N`.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
@@ -27,6 +28,7 @@ impl Sweep {
     /// If a folder cannot be written; with [`Check::Content`], if a user's own file changed since the sweep was planned.
     pub fn take_back_damaged(&self, check: Check) -> Result<Vec<String>> {
         let mut taken = Vec::new();
+        let mut again = BTreeSet::new();
         for entry in self.entries() {
             // What was made of the planned file is whole; another file is another sweep.
             if let Some(change) = self.changed_input(entry).filter(|_| check == Check::Content) {
@@ -39,7 +41,14 @@ impl Sweep {
                         Check::Content => self.damage(entry, &outcome),
                         Check::Existence => self.lost(&outcome),
                     };
-                    let Some(why) = damage else { continue };
+                    // A verdict on a policy that is learned again is one on another policy.
+                    let stale = || {
+                        let run = entry.needs.iter().find(|&n| again.contains(n))?;
+                        let run = &self.entries()[*run];
+                        (entry.kind == Kind::Verdict)
+                            .then(|| format!("it is about the policy of work {run}, which is done again"))
+                    };
+                    let Some(why) = damage.or_else(stale) else { continue };
                     // A record that is another piece's has that piece's files.
                     if outcome.id == entry.id {
                         self.set_aside(entry, &outcome)?;
@@ -48,6 +57,7 @@ impl Sweep {
                 }
                 Err(e) => e.to_string(),
             };
+            again.insert(entry.index);
             let record = self.file("done", &format!("{}.json", entry.id));
             move_aside(&record)?;
             let error = format!("it was done, and is to be done again: {why}");

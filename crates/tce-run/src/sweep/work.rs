@@ -25,7 +25,7 @@ use crate::variant::Variant;
 use crate::verdict::{Candidate, Verdict, only, recommend};
 
 /// What the folders of verdicts begin with.
-pub(crate) const VERDICT: &str = "verdict";
+const VERDICT: &str = "verdict";
 /// Seconds between two heartbeats.
 const BEAT: Duration = Duration::from_secs(10);
 

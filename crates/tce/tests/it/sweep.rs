@@ -284,3 +284,19 @@ fn slurm_and_this_machine_give_the_same_bytes() {
     assert!(fake.tce(dir.path(), &["sweep", "gather", "slurm"]).status.success());
     assert_eq!(outcomes(&dir.path().join("local")), outcomes(&dir.path().join("slurm")));
 }
+
+/// On a bare machine, with the zoo's actors alone.
+#[test]
+fn every_example_can_be_planned() {
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+    let folders = [examples.clone(), examples.join("sensitivity")];
+    let files = folders.iter().flat_map(|folder| fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()));
+    let dir = tempfile::tempdir().unwrap();
+    let mut planned = 0;
+    for file in files.filter(|f| f.extension().is_some_and(|e| e == "toml")) {
+        let plan = tce_json(dir.path(), &["sweep", "plan", file.to_str().unwrap(), "--dry-run"]);
+        assert!(plan["run"].as_u64() > Some(0), "{}: {plan}", file.display());
+        planned += 1;
+    }
+    assert!(planned > 5 && !dir.path().join("runs").exists(), "{planned} examples");
+}

@@ -142,15 +142,41 @@ fn tiers_come_one_after_the_other_and_share_their_work() {
     // A task's rows stand right before the runs that need them.
     let kinds: Vec<Kind> = manifest.entries.iter().take(5).map(|e| e.kind).collect();
     assert_eq!(kinds, [Kind::Source, Kind::Target, Kind::Augment, Kind::Run, Kind::Target]);
-    for entry in &manifest.entries {
-        assert!(entry.needs.iter().all(|&n| n < entry.index), "{entry}");
-    }
+    assert_eq!(Manifest::parse(&manifest.to_jsonl(), Path::new("m")).unwrap(), manifest);
+    // Rows that a later tier adds under another task stand before those who need them.
+    let other_order = TIERS.replace("name = \"first\"", "name = \"first\"\n    variants = [\"bc\"]").replace(
+        "seeds = 3",
+        "seeds = 3\n    tasks = [\"hopper-morph:medium->medium\", \"hopper-morph:medium->expert\"]",
+    );
+    let manifest = plan(&other_order).unwrap();
+    assert_eq!(Manifest::parse(&manifest.to_jsonl(), Path::new("m")).unwrap(), manifest);
     for (change, needle) in [
         ("name = \"second\"\n    seeds = 0", "tier \"second\": there is nothing to run"),
-        ("name = \"first\"\n    seeds = 3", "found the name \"first\", expected one of its own"),
+        ("name = \"first\"\n    seeds = 3", "found the name \"first\", expected a different name"),
         ("name = \"second\"\n    seeds = 30000", "tier \"second\": 4 x 30000 runs; a sweep has at most"),
     ] {
         let message = plan(&TIERS.replace("name = \"second\"\n    seeds = 3", change)).unwrap_err().to_string();
         assert!(message.contains(needle), "{message}");
     }
+    let column = |y: f64| format!("    overrides = [{{ name = \"y\", set = [\"generator.y_max={y}\"] }}]\n");
+    let twice = TIERS.replace(
+        "    [[tiers]]\n    name = \"second\"",
+        &format!("{}    [[tiers]]\n    name = \"second\"", column(0.1)),
+    );
+    let message = plan(&(twice.clone() + &column(0.2))).unwrap_err().to_string();
+    assert!(message.contains("tier \"second\": overrides: \"y\" sets"), "{message}");
+    assert!(plan(&(twice + &column(0.1))).is_ok());
+}
+
+/// A verdict chooses once for a task and a seed, as soon as there are a baseline and a method.
+#[test]
+fn verdicts_choose_among_baselines_and_methods() {
+    let text = "tasks = [\"hopper-morph:medium->expert\"]\nverdicts = true\n[[tiers]]\nname = \"a\"\nvariants = [\"tce-og\"]\nbaselines = false\n\
+                [[tiers]]\nname = \"b\"\nvariants = [\"bc\"]\nbaselines = false\nseeds = 2\n\
+                [[tiers]]\nname = \"c\"\nvariants = [\"otdf\"]\nbaselines = false\n";
+    let manifest = plan(text).unwrap();
+    let verdicts: Vec<&Entry> = manifest.entries.iter().filter(|e| e.kind == Kind::Verdict).collect();
+    assert_eq!(verdicts.len(), 1, "seed 1 has a baseline alone");
+    let names: Vec<&str> = verdicts[0].needs.iter().map(|&n| manifest.entries[n].variant.unwrap().name()).collect();
+    assert_eq!((verdicts[0].tier.as_str(), verdicts[0].seed, names), ("b", 0, vec!["tce-og", "bc"]));
 }

@@ -102,7 +102,7 @@ impl Rates {
             Algorithm::Bc => {
                 let width = |hidden: &[usize]| hidden.windows(2).map(|w| (w[0] * w[1]) as f64).sum::<f64>();
                 let layers = width(&learner.bc.actor.hidden) / width(&[256, 256]);
-                self.seconds("bc", steps * layers * learner.bc.ensemble as f64 * learner.batch as f64 / 256.0)?
+                self.seconds("bc", steps * layers * learner.bc.ensemble as f64 * learner.batch() as f64 / 256.0)?
             }
             Algorithm::MetaDt => {
                 self.seconds("meta-dt", steps)?

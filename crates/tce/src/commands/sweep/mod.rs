@@ -132,7 +132,7 @@ pub struct Gather {
 /// Arguments of `sweep export`.
 #[derive(Debug, Args)]
 pub struct Export {
-    /// A sweep's folder, a folder with runs of `tce run`, or a record of before. Several become one record.
+    /// A sweep's folder, a folder with runs of `tce run`, or an earlier record. Several become one record.
     #[arg(required = true, value_name = "PLACE")]
     places: Vec<PathBuf>,
     /// The record, JSON Lines; `tce report` reads it.
@@ -215,7 +215,7 @@ impl Plan {
                 };
                 let rows = costs.iter().filter(|c| !c.tier.is_empty()).chain([&all]);
                 let rows = rows.map(|c| [c.tier.clone(), c.pieces.to_string(), hours(c.core_hours)]);
-                text += &format!("\n{}", table(&["tier", "pieces", "about so many core-hours"], rows));
+                text += &format!("\n{}", table(&["tier", "pieces", "core-hours, about"], rows));
             }
             format!("{text}\n{}", p.directory.display())
         });
