@@ -44,13 +44,14 @@ def paper(shift, agent):
 
 def main():
     ours = scores()
+    series = [s for s in OURS if any(method == s[0] for _, method in ours)] + THEIRS
     plt.rcParams.update({"font.size": 9, "svg.hashsalt": "tce", "svg.fonttype": "none"})
     figure, axes = plt.subplots(len(SHIFTS), 1, figsize=(8, 7.2), sharey=True)
     for axis, shift in zip(axes, SHIFTS):
-        for k, (key, label, colour) in enumerate(OURS + THEIRS):
+        for k, (key, label, colour) in enumerate(series):
             for place, agent in enumerate(AGENTS):
-                values = ours.get((f"{agent}-{shift}:medium->expert", key), []) if k < 2 else [paper(shift, agent)[key]]
-                x = place + (k - 1.5) * 0.21
+                values = ours.get((f"{agent}-{shift}:medium->expert", key), []) if series[k] in OURS else [paper(shift, agent)[key]]
+                x = place + (k - (len(series) - 1) / 2) * 0.22
                 mean = sum(values) / len(values) if values else 0
                 axis.bar(x, mean, 0.19, color=colour, label=label if place == 0 else None)
                 if len(values) > 1:

@@ -145,7 +145,7 @@ mod tests {
         assert_eq!(changed, Some(("quick".into(), vec!["learner.steps = 60 (12000)".into()])));
         // What a configuration leaves out at its usual value is a change all the same.
         for (preset, set, told) in [
-            (Preset::Default, "learner.bc.batch=0", "learner.bc.batch = 0 (64)"),
+            (Preset::Default, "learner.bc.batch=0", "learner.bc.batch = 0 (128)"),
             (Preset::Default, "learner.bc.loss=likelihood", "learner.bc.loss = \"likelihood\" (\"squared\")"),
             (Preset::Default, "learner.bc.dropout=0.2", "learner.bc.dropout = 0.2 (0.0)"),
             (Preset::Default, "filter.by=consistency", "filter.by = \"consistency\" (\"zscore\")"),

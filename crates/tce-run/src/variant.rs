@@ -155,9 +155,11 @@ impl Variant {
 
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
     pub(crate) fn layer(self, lambda: f64, shift: Option<Shift>) -> String {
-        // What is not TCE imitates all trajectories, as published.
+        // What is not the program's own imitates all trajectories, as published. The ensemble of clones is what TCE has to beat: it imitates
+        // what TCE imitates.
+        let own = |generated: &str| generated == "tce" || self == Variant::BcEnsemble;
         let rows = |generated: &str, source: &str, lambda: f64| {
-            let all = if generated == "tce" { "" } else { "target.trajectories = \"all\"\n" };
+            let all = if own(generated) { "" } else { "target.trajectories = \"all\"\n" };
             format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n{all}")
         };
         // IQL without TCE's regulariser.
@@ -246,6 +248,20 @@ impl<'de> Deserialize<'de> for Variant {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_programs_own_methods_choose_trajectories() {
+        use crate::config::Trajectories::{All, Auto};
+        for (variant, expected) in [
+            (Variant::TceOg, Auto),
+            (Variant::BcEnsemble, Auto),
+            (Variant::Bc, All),
+            (Variant::BcTop, All),
+            (Variant::Prior(Algorithm::Otdf, Mode::Corrected), All),
+        ] {
+            assert_eq!(variant.own().target.trajectories, expected, "{variant}");
+        }
+    }
 
     #[test]
     fn forms_of_prior_methods_come_from_the_registry() {
