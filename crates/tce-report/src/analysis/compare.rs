@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improvement};
 use crate::study::Study;
 
-/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method has, the method with the fewest
+/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method that is no baseline has, the method with the fewest
 /// tasks is left out, one after the other, a baseline last of all: a beginning of one method must not take the others' results away.
 pub(super) fn compare(
     study: &Study,
@@ -21,7 +21,9 @@ pub(super) fn compare(
     let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
     let shared =
         |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
-    let most = kept.iter().map(|m| count(*m)).max().unwrap_or(0);
+    // Baselines that were run on more tasks than any method must not leave themselves alone in it.
+    let fullest = |methods: &dyn Fn(usize) -> bool| kept.iter().filter(|m| methods(**m)).map(|m| count(*m)).max();
+    let most = fullest(&|m| !study.methods[m].baseline).or_else(|| fullest(&|_| true)).unwrap_or(0);
     while 2 * shared(&kept).len() < most.max(1) {
         let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].baseline, std::cmp::Reverse(**m)))
         else {

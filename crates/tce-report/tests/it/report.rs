@@ -293,6 +293,23 @@ fn a_beginning_does_not_shrink_the_comparison() {
     assert!(warned(&analysis, "Left out of the means over tasks, for lack of scores on more than half of the tasks"));
 }
 
+/// Baselines on six tasks, methods on two of them: the methods are what a reader wants compared.
+#[test]
+fn baselines_on_more_tasks_do_not_stand_alone() {
+    let root = tempfile::tempdir().unwrap();
+    let mut study = study(root.path());
+    let runs = study.runs.clone();
+    for quality in [Quality::MediumExpert, Quality::Medium] {
+        let baselines = runs.iter().filter(|r| r.method.starts_with("bc") && r.task.agent == Agent::Hopper).cloned();
+        study.runs.extend(baselines.map(|r| Run { task: task(Agent::Walker2d, quality), ..r }));
+        let baselines = runs.iter().filter(|r| r.method.starts_with("bc") && r.task.agent == Agent::Hopper).cloned();
+        study.runs.extend(baselines.map(|r| Run { task: task(Agent::HalfCheetah, quality), ..r }));
+    }
+    let (analysis, _) = page(&study);
+    let c = analysis.comparison.as_ref().unwrap();
+    assert_eq!((c.left_out.len(), c.tasks.len(), c.methods.len()), (0, 2, 6));
+}
+
 #[test]
 fn one_seed_has_no_interval_and_no_finding() {
     let root = tempfile::tempdir().unwrap();
