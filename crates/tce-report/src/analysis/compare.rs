@@ -7,36 +7,42 @@ use crate::error::Result;
 use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improvement};
 use crate::study::Study;
 
-/// Methods on the tasks that all of them have. Where that is fewer than half of what the fullest method that is no baseline has, the method with the fewest
-/// tasks is left out, one after the other, a baseline last of all: a beginning of one method must not take the others' results away.
+/// Which methods are compared, and which are left out, both ascending. Where all of them have fewer than half of the tasks that the fullest
+/// method that is no baseline has, the method with the fewest tasks is left out, one after the other, a baseline last of all: a beginning of
+/// one method must not take the others' results away.
+fn compared(study: &Study, tasks: usize, scores: &[Vec<Vec<f64>>]) -> (Vec<usize>, Vec<usize>) {
+    let has = |t: usize, m: usize| !scores[t][m].is_empty();
+    let count = |m: usize| (0..tasks).filter(|t| has(*t, m)).count();
+    let (mut kept, mut left_out): (Vec<usize>, Vec<usize>) = (0..study.methods.len()).partition(|m| count(*m) > 0);
+    let shared = |kept: &[usize]| (0..tasks).filter(|t| kept.iter().all(|m| has(*t, *m))).count();
+    // Baselines that were run on more tasks than any method must not leave themselves alone in it.
+    let fullest = |methods: &dyn Fn(usize) -> bool| kept.iter().filter(|m| methods(**m)).map(|m| count(*m)).max();
+    let most = fullest(&|m| !study.methods[m].baseline).or_else(|| fullest(&|_| true)).unwrap_or(0);
+    let least = |kept: &[usize]| {
+        kept.iter().copied().min_by_key(|m| (count(*m), study.methods[*m].baseline, std::cmp::Reverse(*m)))
+    };
+    while 2 * shared(&kept) < most.max(1)
+        && let Some(last) = least(&kept)
+    {
+        kept.retain(|m| *m != last);
+        left_out.push(last);
+    }
+    left_out.sort_unstable();
+    (kept, left_out)
+}
+
+/// Methods on the tasks that all of them have ([`compared`]).
 pub(super) fn compare(
     study: &Study,
     bootstrap: &Bootstrap,
     tasks: &[Task],
     scores: &[Vec<Vec<f64>>],
 ) -> Result<Option<Comparison>> {
-    let has = |t: usize, m: usize| !scores[t][m].is_empty();
-    let count = |m: usize| (0..tasks.len()).filter(|t| has(*t, m)).count();
-    let mut kept: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) > 0).collect();
-    let mut left_out: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) == 0).collect();
-    let shared =
-        |kept: &[usize]| -> Vec<usize> { (0..tasks.len()).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
-    // Baselines that were run on more tasks than any method must not leave themselves alone in it.
-    let fullest = |methods: &dyn Fn(usize) -> bool| kept.iter().filter(|m| methods(**m)).map(|m| count(*m)).max();
-    let most = fullest(&|m| !study.methods[m].baseline).or_else(|| fullest(&|_| true)).unwrap_or(0);
-    while 2 * shared(&kept).len() < most.max(1) {
-        let Some(&last) = kept.iter().min_by_key(|m| (count(**m), study.methods[**m].baseline, std::cmp::Reverse(**m)))
-        else {
-            return Ok(None);
-        };
-        kept.retain(|m| *m != last);
-        left_out.push(last);
-    }
+    let (kept, left_out) = compared(study, tasks.len(), scores);
     if kept.is_empty() {
         return Ok(None);
     }
-    left_out.sort_unstable();
-    let places = shared(&kept);
+    let places: Vec<usize> = (0..tasks.len()).filter(|t| kept.iter().all(|m| !scores[*t][*m].is_empty())).collect();
     let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());
     let tables = kept.iter().map(|&m| of(m)).collect::<Result<Vec<_>, _>>()?;
     let baselines: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].baseline).collect();
