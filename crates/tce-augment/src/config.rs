@@ -81,6 +81,16 @@ pub enum Length {
     Auto,
 }
 
+impl Length {
+    /// The most updates that it can come to, where a training until it is done ends at `limit`.
+    pub fn most(self, limit: u64) -> u64 {
+        match self {
+            Length::Steps(steps) => steps,
+            Length::Auto => limit,
+        }
+    }
+}
+
 impl Serialize for Length {
     fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use tce_data::Task;
 
-use crate::folder::{RunFolder, Verdict};
+use crate::folder::Verdict;
 use crate::study::{Method, Missing, Run, Study};
 
 /// All of `studies` as one, in their order. A run that several of them have counts once. Where they differ about a run of the same
@@ -183,40 +183,4 @@ fn add_new<T: PartialEq>(known: &mut Vec<T>, more: impl IntoIterator<Item = T>) 
             known.push(one);
         }
     }
-}
-
-/// The column of every run, given as task, name, folder and seed: its name. Where a task has two runs of one name and seed, they differ in
-/// their settings or their data, and every setting, or else every folder, of that name is a column of its own. The second list has a note
-/// for a reader on every such name.
-pub fn columns(runs: &[(Task, &str, &RunFolder, u64)]) -> (Vec<String>, Vec<String>) {
-    let mut ids: Vec<String> = runs.iter().map(|r| r.1.to_owned()).collect();
-    let mut notes = Vec::new();
-    let marks: [fn(&RunFolder) -> String; 2] = [
-        |f| f.config_hash[..6].to_owned(),
-        |f| {
-            let name = f.directory.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-            name.rsplit('-').next().unwrap_or_default().to_owned()
-        },
-    ];
-    for mark in marks {
-        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
-        let mut twice: BTreeSet<&str> = BTreeSet::new();
-        for ((task, name, _, seed), id) in runs.iter().zip(&ids) {
-            if !seen.insert((*task, id, *seed)) {
-                twice.insert(name);
-            }
-        }
-        for ((_, name, folder, _), id) in runs.iter().zip(&mut ids).filter(|((_, name, ..), _)| twice.contains(name)) {
-            *id = format!("{name} {}", mark(folder));
-        }
-        for name in twice {
-            let note = format!(
-                "{name}: a task has several runs of one seed with different settings or data; each is a column of its own."
-            );
-            if !notes.contains(&note) {
-                notes.push(note);
-            }
-        }
-    }
-    (ids, notes)
 }

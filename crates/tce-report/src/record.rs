@@ -13,9 +13,7 @@
 //!
 //! Lines have a fixed order, so that a record that gains runs changes by added lines.
 
-use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -59,14 +57,6 @@ struct AnyHeader {
     program: String,
 }
 
-/// Whether the file at `path` begins as a record does.
-pub fn is_record(path: &Path) -> bool {
-    let mut first = Vec::new();
-    // The first line is short; another file may have no line break at all.
-    let head = File::open(path).and_then(|file| BufReader::new(file.take(1 << 16)).read_until(b'\n', &mut first));
-    head.is_ok() && serde_json::from_slice::<AnyRecord>(&first).is_ok()
-}
-
 /// The record of `study`, as text. Of a run's folder only the name is kept.
 pub fn to_text(study: &Study) -> String {
     let header = Line::Record { format: FORMAT, name: study.name.clone(), program: PROGRAM.into(), sweep: study.sweep };
@@ -79,17 +69,11 @@ pub fn to_text(study: &Study) -> String {
         study.runs.iter().map(|r| (r.folder.config_hash.as_str(), r.folder.config.as_str())).collect();
     lines.extend(configs.into_iter().map(|(hash, toml)| Line::Config { hash: hash.into(), toml: toml.into() }));
     // One line a folder, with those of its members that the study has.
-    let mut folders: Vec<Vec<&Run>> = Vec::new();
+    let mut folders: BTreeMap<(*const RunFolder, Task, &str), Vec<&Run>> = BTreeMap::new();
     for run in &study.runs {
-        let same = |group: &&mut Vec<&Run>| {
-            let first = group[0];
-            Arc::ptr_eq(&first.folder, &run.folder) && (first.task, &first.method) == (run.task, &run.method)
-        };
-        match folders.iter_mut().find(same) {
-            Some(group) => group.push(run),
-            None => folders.push(vec![run]),
-        }
+        folders.entry((Arc::as_ptr(&run.folder), run.task, &run.method)).or_default().push(run);
     }
+    let mut folders: Vec<Vec<&Run>> = folders.into_values().collect();
     folders.sort_by_key(|group| {
         let first = group[0];
         (order(&first.task), first.method.clone(), first.member.seed, first.folder.config_hash.clone())
@@ -150,7 +134,7 @@ pub fn read(path: &Path) -> Result<Study> {
     if let Line::Record { name, sweep, .. } = parse(1, first)? {
         (study.name, study.sweep) = (name, sweep);
     }
-    let mut configs = BTreeMap::new();
+    let (mut configs, mut seen) = (BTreeMap::new(), BTreeSet::new());
     for (n, line) in lines {
         match parse(n, line)? {
             Line::Record { .. } => return Err(wrong(n, "a second header".into(), "one header, in the first line")),
@@ -180,10 +164,7 @@ pub fn read(path: &Path) -> Result<Study> {
                     return Err(wrong(n, format!("method {method:?}"), "a `method` line of this id before the run"));
                 }
                 let folder = RunFolder { config, ..*folder };
-                let twice = folder.members.iter().find(|member| {
-                    let same = |r: &&Run| (r.task, &r.method, r.member.seed) == (task, &method, member.seed);
-                    study.runs.iter().any(|r| same(&r))
-                });
+                let twice = folder.members.iter().find(|member| !seen.insert((task, method.clone(), member.seed)));
                 if let Some(member) = twice {
                     let found = format!("a second run of {method}, {task}, seed {}", member.seed);
                     return Err(wrong(n, found, "one run for every method, task and seed"));

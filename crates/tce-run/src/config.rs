@@ -144,6 +144,13 @@ pub struct MixtureConfig {
     pub lambda: f64,
 }
 
+impl MixtureConfig {
+    /// Whether rows besides the target's join it.
+    pub fn has_other_rows(&self) -> bool {
+        self.generated != GeneratedRows::None || self.source != SourceRows::None
+    }
+}
+
 /// How policies are evaluated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -1,16 +1,16 @@
 //! What a report is made from: sweeps' folders, folders with runs of `tce run`, and records of either.
 
-use clap::ValueEnum;
-use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+
+use clap::ValueEnum;
+use serde_json::Value;
 use tce_base::FileError;
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
 use tce_learn::Mode;
 use tce_report::folder::Verdict;
-use tce_report::merge::columns;
 use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, record};
 
 use crate::config::Config;
@@ -269,7 +269,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
         ));
     }
     let mut notes = Vec::new();
-    let ids = ids(&finished, &mut notes);
+    let ids = columns(&finished, &mut notes);
     let mut methods: Vec<Method> = Vec::new();
     for (name, id) in finished.iter().map(|f| &f.1).zip(&ids).chain(missing.iter().map(|m| (&m.method, &m.method))) {
         if methods.iter().any(|m| m.id == *id) {
@@ -314,19 +314,37 @@ fn of_runs(directory: &Path) -> Result<Study> {
     Ok(study)
 }
 
-/// The column of every finished run ([`columns`] of each of its members).
-fn ids(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
-    let members = finished.iter().flat_map(|(task, name, folder)| {
-        folder.members.iter().map(move |member| (*task, name.as_str(), folder, member.seed))
-    });
-    let (all, told) = columns(&members.collect::<Vec<_>>());
-    notes.extend(told);
-    let mut all = all.into_iter();
-    let first = |(_, name, folder): &(Task, String, RunFolder)| {
-        let own: Vec<String> = all.by_ref().take(folder.members.len()).collect();
-        own.into_iter().next().unwrap_or_else(|| name.clone())
-    };
-    finished.iter().map(first).collect()
+/// The column of every finished run: its name. Where a task has two runs of one name and seed, they differ in their settings or
+/// their data, and every setting, or else every folder, of that name is a column of its own.
+fn columns(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
+    let mut ids: Vec<String> = finished.iter().map(|(_, name, _)| name.clone()).collect();
+    let marks: [fn(&RunFolder) -> String; 2] = [
+        |f| f.config_hash[..6].to_owned(),
+        |f| name_of(&f.directory).rsplit('-').next().unwrap_or_default().to_owned(),
+    ];
+    for mark in marks {
+        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
+        let mut twice: BTreeSet<String> = BTreeSet::new();
+        for ((of, name, folder), id) in finished.iter().zip(&ids) {
+            for member in &folder.members {
+                if !seen.insert((*of, id, member.seed)) {
+                    twice.insert(name.clone());
+                }
+            }
+        }
+        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|((_, name, _), _)| twice.contains(name)) {
+            *id = format!("{name} {}", mark(folder));
+        }
+        for name in twice {
+            let note = format!(
+                "{name}: a task has several runs of one seed with different settings or data; each is a column of its own."
+            );
+            if !notes.contains(&note) {
+                notes.push(note);
+            }
+        }
+    }
+    ids
 }
 
 fn json(path: &Path) -> Option<Value> {

@@ -148,6 +148,17 @@ pub fn recommend(
     Ok(verdict)
 }
 
+/// [`recommend`] without fitted Q. A single policy is taken without being tried: where there is a simulator, it has been evaluated.
+///
+/// # Errors
+/// As [`recommend`].
+pub fn recommend_or_only(
+    evaluator: impl FnOnce() -> Result<OffPolicyEvaluator>,
+    candidates: &[Candidate],
+) -> Result<Verdict> {
+    only(candidates).map_or_else(|| recommend(evaluator, candidates, None), Ok)
+}
+
 fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Result<Verdict> {
     let returns: Vec<Vec<f64>> = estimates.iter().map(|j| episodes(j)).collect();
     let mean = |k: usize| mean_std(&returns[k]).0;

@@ -7,28 +7,29 @@ use crate::error::Result;
 use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improvement};
 use crate::study::Study;
 
-/// Which methods are compared, and which are left out, both ascending. Where all of them have fewer than half of the tasks that the fullest
+/// Which methods are compared, on which tasks, and which methods are left out, all ascending. Where all of them have fewer than half of the tasks that the fullest
 /// method that is no baseline has, the method with the fewest tasks is left out, one after the other, a baseline last of all: a beginning of
 /// one method must not take the others' results away.
-fn compared(study: &Study, tasks: usize, scores: &[Vec<Vec<f64>>]) -> (Vec<usize>, Vec<usize>) {
+fn compared(study: &Study, tasks: usize, scores: &[Vec<Vec<f64>>]) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
     let has = |t: usize, m: usize| !scores[t][m].is_empty();
     let count = |m: usize| (0..tasks).filter(|t| has(*t, m)).count();
     let (mut kept, mut left_out): (Vec<usize>, Vec<usize>) = (0..study.methods.len()).partition(|m| count(*m) > 0);
-    let shared = |kept: &[usize]| (0..tasks).filter(|t| kept.iter().all(|m| has(*t, *m))).count();
+    let shared = |kept: &[usize]| -> Vec<usize> { (0..tasks).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
     // Baselines that were run on more tasks than any method must not leave themselves alone in it.
     let fullest = |methods: &dyn Fn(usize) -> bool| kept.iter().filter(|m| methods(**m)).map(|m| count(*m)).max();
     let most = fullest(&|m| !study.methods[m].baseline).or_else(|| fullest(&|_| true)).unwrap_or(0);
     let least = |kept: &[usize]| {
         kept.iter().copied().min_by_key(|m| (count(*m), study.methods[*m].baseline, std::cmp::Reverse(*m)))
     };
-    while 2 * shared(&kept) < most.max(1)
+    while 2 * shared(&kept).len() < most.max(1)
         && let Some(last) = least(&kept)
     {
         kept.retain(|m| *m != last);
         left_out.push(last);
     }
     left_out.sort_unstable();
-    (kept, left_out)
+    let places = shared(&kept);
+    (kept, places, left_out)
 }
 
 /// Methods on the tasks that all of them have ([`compared`]).
@@ -38,11 +39,10 @@ pub(super) fn compare(
     tasks: &[Task],
     scores: &[Vec<Vec<f64>>],
 ) -> Result<Option<Comparison>> {
-    let (kept, left_out) = compared(study, tasks.len(), scores);
+    let (kept, places, left_out) = compared(study, tasks.len(), scores);
     if kept.is_empty() {
         return Ok(None);
     }
-    let places: Vec<usize> = (0..tasks.len()).filter(|t| kept.iter().all(|m| !scores[*t][*m].is_empty())).collect();
     let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());
     let tables = kept.iter().map(|&m| of(m)).collect::<Result<Vec<_>, _>>()?;
     let baselines: Vec<usize> = kept.iter().copied().filter(|m| study.methods[*m].baseline).collect();
@@ -55,7 +55,8 @@ pub(super) fn compare(
         iqm(a).total_cmp(&iqm(b))
     });
     let mut methods = Vec::new();
-    for (&m, scores) in kept.iter().zip(&tables) {
+    let ranks = ranks(&tables);
+    for ((&m, scores), rank) in kept.iter().zip(&tables).zip(ranks) {
         let method = &study.methods[m];
         let statistics =
             |s: &[&Scores]| vec![s[0].iqm(), s[0].median(), s[0].mean(), s[0].optimality_gap(GAMMA), s[0].total()];
@@ -88,7 +89,7 @@ pub(super) fn compare(
             over_seeds: [runs[0], runs[1], runs[2], runs[3]],
             over_tasks: [both[0], both[1], both[2], both[3]],
             total: runs[4],
-            rank: rank(&tables, kept.iter().position(|k| *k == m).expect("it is kept")),
+            rank,
             profile,
             over_baselines,
             p_value,
@@ -98,21 +99,20 @@ pub(super) fn compare(
     Ok(Some(Comparison { tasks, methods, left_out, baselines, best_baseline, level: bootstrap.level, thresholds }))
 }
 
-/// Mean over tasks of the place of method `m` of `tables`, by the mean over runs.
-fn rank(tables: &[Scores], m: usize) -> f64 {
+/// For each of `tables`, the mean over tasks of its place among them, by the mean over runs.
+fn ranks(tables: &[Scores]) -> Vec<f64> {
     let means: Vec<Vec<f64>> = tables.iter().map(|t| t.task_means().collect()).collect();
-    let place = |t: usize| {
-        let (higher, equal) =
-            means.iter().fold((0, 0), |(higher, equal), other| match other[t].total_cmp(&means[m][t]) {
-                std::cmp::Ordering::Greater => (higher + 1, equal),
-                std::cmp::Ordering::Equal => (higher, equal + 1),
-                std::cmp::Ordering::Less => (higher, equal),
-            });
+    let place = |own: f64, t: usize| {
+        let (higher, equal) = means.iter().fold((0, 0), |(higher, equal), other| match other[t].total_cmp(&own) {
+            std::cmp::Ordering::Greater => (higher + 1, equal),
+            std::cmp::Ordering::Equal => (higher, equal + 1),
+            std::cmp::Ordering::Less => (higher, equal),
+        });
         // Of `equal` methods that share places the mean one; it is one of them itself.
         f64::from(higher) + f64::from(1 + equal) / 2.0
     };
-    let tasks = means[m].len();
-    (0..tasks).map(place).sum::<f64>() / tasks as f64
+    let mean = |own: &Vec<f64>| own.iter().zip(0..).map(|(m, t)| place(*m, t)).sum::<f64>() / own.len() as f64;
+    means.iter().map(mean).collect()
 }
 
 /// Every second point from below the lowest score to above the highest, 0 and 100 included.

@@ -3,7 +3,7 @@
 use maud::{Markup, html};
 use tce_data::{Quality, Shift};
 
-use super::{counted, one, signed, term, title_cell};
+use super::{capital, counted, one, signed, term, title_cell};
 use crate::analysis::{Analysis, Effect, Gap, LEAST, SURE};
 use crate::stats::Estimate;
 use crate::study::agent_title;
@@ -61,10 +61,6 @@ pub(super) fn effects(analysis: &Analysis) -> Option<Markup> {
             }
         }
     })
-}
-
-fn capital(word: &str) -> String {
-    word[..1].to_uppercase() + &word[1..]
 }
 
 fn class(effect: Effect) -> &'static str {

@@ -3,16 +3,10 @@
 use maud::{Markup, html};
 use tce_data::Shift;
 
-use super::{counted, estimate, one, said, signed, term, title_cell};
+use super::{capital, counted, estimate, one, said, signed, term, title_cell};
 use crate::analysis::{Aggregate, Analysis, Comparison, Finding, gap_words, verdict_words};
 use crate::paper;
 use crate::study::Study;
-
-/// With a capital letter.
-fn capital(text: &str) -> String {
-    let mut rest = text.chars();
-    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
-}
 
 /// Three digits, or that it is below them.
 fn p_value(a: &Aggregate) -> (bool, String) {

@@ -18,7 +18,7 @@ mod scores;
 mod statistics;
 pub(crate) mod words;
 
-use parts::{classes, estimate, one, percent, range, said, signed, title_cell};
+use parts::{capital, classes, estimate, one, percent, range, said, signed, title_cell};
 pub(crate) use parts::{counted, decades, document, duration};
 pub(crate) use words::term;
 

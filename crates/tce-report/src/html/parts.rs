@@ -47,6 +47,12 @@ pub(crate) fn estimate(e: &Estimate, decimals: usize) -> Markup {
     html! { (minus(format!("{:.decimals$}", e.point))) " " small { (range(e.interval, decimals)) } }
 }
 
+/// With a capital letter.
+pub(crate) fn capital(text: &str) -> String {
+    let mut rest = text.chars();
+    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
+}
+
 /// With its sign.
 pub(crate) fn signed(value: f64) -> String {
     if value > 0.0 { format!("+{value:.1}") } else { one(value) }

@@ -72,7 +72,7 @@ pub enum Unavailable {
 }
 
 /// A part of a sweep. What it does not say is as the description has it.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tier {
     /// Its name.
@@ -140,15 +140,7 @@ impl Description {
     /// # Errors
     /// If there is nothing to run, too much, or two tiers of one name: in words.
     pub(super) fn parts(&self) -> Result<Vec<Part>, String> {
-        let whole = Tier {
-            name: String::new(),
-            tasks: None,
-            variants: None,
-            baselines: None,
-            seeds: None,
-            first_seed: None,
-            overrides: None,
-        };
+        let whole = Tier::default();
         let tiers = if self.tiers.is_empty() { std::slice::from_ref(&whole) } else { &self.tiers[..] };
         let mut names = BTreeSet::new();
         let mut columns: BTreeMap<String, Vec<String>> = BTreeMap::new();

@@ -371,6 +371,17 @@ impl Manifest {
         }
     }
 
+    /// The names of the tiers, in their order; one empty name without tiers.
+    pub fn tiers(&self) -> Vec<&str> {
+        let mut names: Vec<&str> = Vec::new();
+        for entry in &self.entries {
+            if !names.contains(&entry.tier.as_str()) {
+                names.push(&entry.tier);
+            }
+        }
+        names
+    }
+
     /// As `manifest.jsonl` has it.
     pub fn to_jsonl(&self) -> String {
         let line = |value: serde_json::Value| format!("{value}\n");

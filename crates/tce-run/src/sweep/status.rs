@@ -56,6 +56,13 @@ pub struct TierState {
     pub seconds_left: Option<f64>,
 }
 
+impl TierState {
+    /// A tier of which no work was looked at yet.
+    fn new(name: &str) -> Self {
+        Self { name: name.to_owned(), done: 0, all: 0, seconds: 0.0, seconds_left: Some(0.0) }
+    }
+}
+
 /// A piece of work that is running.
 #[derive(Clone, Debug, Serialize)]
 pub struct Running {
@@ -85,9 +92,11 @@ impl Sweep {
             waiting: Vec::new(),
             faults: fs::read_dir(self.directory.join("faults")).map_or(0, Iterator::count),
             seconds_left: None,
-            tiers: Vec::new(),
+            tiers: self.manifest.tiers().into_iter().filter(|name| !name.is_empty()).map(TierState::new).collect(),
             scores: Vec::new(),
         };
+        // The kind and column of unfinished work, by the place of its tier.
+        let mut left: Vec<(usize, (Kind, String))> = Vec::new();
         // Seconds that work of a kind and column took, and what is left of it.
         let mut times: BTreeMap<(Kind, String), (f64, usize, usize)> = BTreeMap::new();
         let mut scores: BTreeMap<(String, String), Vec<f64>> = BTreeMap::new();
@@ -95,7 +104,15 @@ impl Sweep {
             let kind = status.kinds.entry(entry.kind).or_default();
             kind.1 += 1;
             let time = times.entry((entry.kind, entry.column())).or_default();
+            let tier = status.tiers.iter().position(|t| t.name == entry.tier);
+            if let Some(tier) = tier {
+                status.tiers[tier].all += 1;
+            }
             if let Some(outcome) = self.outcome(entry)? {
+                if let Some(tier) = tier {
+                    status.tiers[tier].done += 1;
+                    status.tiers[tier].seconds += outcome.seconds;
+                }
                 kind.0 += 1;
                 time.0 += outcome.seconds;
                 time.1 += 1;
@@ -105,6 +122,7 @@ impl Sweep {
                 continue;
             }
             time.2 += 1;
+            left.extend(tier.map(|tier| (tier, (entry.kind, entry.column()))));
             if let Some(active) = active.get(&entry.id) {
                 status.running.extend(active.iter().map(|a| Running {
                     index: entry.index,
@@ -118,7 +136,11 @@ impl Sweep {
                 status.waiting.push(entry.index);
             }
         }
-        status.tiers = self.tiers(&times)?;
+        for (tier, work) in left {
+            let (seconds, done, _) = times[&work];
+            let (sum, each) = (status.tiers[tier].seconds_left, (done > 0).then(|| seconds / done as f64));
+            status.tiers[tier].seconds_left = sum.zip(each).map(|(sum, each)| sum + each);
+        }
         let known = times.values().all(|&(_, done, left)| done > 0 || left == 0);
         let work: f64 = times.values().map(|&(seconds, done, left)| seconds / done.max(1) as f64 * left as f64).sum();
         // What failed may fail again, and what nobody does takes for ever.
@@ -126,32 +148,6 @@ impl Sweep {
         status.seconds_left = known.then(|| work / status.running.len() as f64);
         status.scores = scores.into_iter().map(|((task, column), scores)| (task, column, scores)).collect();
         Ok(status)
-    }
-
-    /// The tiers; `times` is what work of a kind and column took, and how many pieces of it are done and left.
-    fn tiers(&self, times: &BTreeMap<(Kind, String), (f64, usize, usize)>) -> Result<Vec<TierState>> {
-        let mut tiers: Vec<TierState> = Vec::new();
-        for entry in self.entries().iter().filter(|e| !e.tier.is_empty()) {
-            let at = tiers.iter().position(|t| t.name == entry.tier).unwrap_or_else(|| {
-                let name = entry.tier.clone();
-                tiers.push(TierState { name, done: 0, all: 0, seconds: 0.0, seconds_left: Some(0.0) });
-                tiers.len() - 1
-            });
-            let tier = &mut tiers[at];
-            tier.all += 1;
-            match self.outcome(entry)? {
-                Some(outcome) => {
-                    tier.done += 1;
-                    tier.seconds += outcome.seconds;
-                }
-                None => {
-                    let (seconds, done, _) = times[&(entry.kind, entry.column())];
-                    let each = (done > 0).then(|| seconds / done as f64);
-                    tier.seconds_left = tier.seconds_left.zip(each).map(|(sum, each)| sum + each);
-                }
-            }
-        }
-        Ok(tiers)
     }
 
     /// Running processes, by the work's id.

@@ -22,7 +22,7 @@ use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::pipeline::run;
 use crate::stage::files_of;
 use crate::variant::Variant;
-use crate::verdict::{Candidate, Verdict, only, recommend};
+use crate::verdict::{Candidate, Verdict, recommend_or_only};
 
 /// What the folders of verdicts begin with.
 const VERDICT: &str = "verdict";
@@ -266,7 +266,7 @@ impl Sweep {
         }
         let inputs = Inputs::of_config(entry.task, &self.data(entry), widest.as_ref().unwrap_or(config))?;
         let evaluator = || OffPolicyEvaluator::train(&inputs, &config.dynamics, &root, device);
-        let verdict = only(&candidates).map_or_else(|| recommend(evaluator, &candidates, None), Ok)?;
+        let verdict = recommend_or_only(evaluator, &candidates)?;
         let task = root.join(entry.task.directory());
         let place = task.join(format!("{VERDICT}-seed{}-{}", entry.seed, &entry.id[..12]));
         fs::create_dir_all(&place).map_err(|e| FileError::new(&place, "create the directory", e))?;

@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_augment::config::Length;
 use tce_base::{set_quiet, write_json};
 use tce_nn::Device;
 use tce_run::device_kind::DeviceKind;
@@ -112,13 +111,9 @@ fn whole_task(measured: &[Measured]) -> Result<Option<WholeTask>> {
     };
     // Two threads train the two networks side by side.
     // A network that trains until it is done takes as long as its limit at most.
-    let steps = |length: Length, limit: u64| match length {
-        Length::Steps(steps) => steps as f64,
-        Length::Auto => limit as f64,
-    };
     let (a, b) = (
-        steps(g.state_steps, g.until_done.state_limit) / score,
-        steps(g.transition_steps, g.until_done.transition_limit) / score,
+        g.state_steps.most(g.until_done.state_limit) as f64 / score,
+        g.transition_steps.most(g.until_done.transition_limit) as f64 / score,
     );
     let score_training = if rayon::current_num_threads() > 1 { a.max(b) } else { a + b };
     let (label_models, behaviour_model) =

@@ -6,7 +6,7 @@ use tce_base::plus_minus;
 use tce_data::Task;
 use tce_learn::{DynamicsConfig, LabelErrors};
 use tce_nn::Device;
-use tce_run::config::{Algorithm, Config, GeneratedRows, SourceRows};
+use tce_run::config::{Algorithm, Config};
 use tce_run::course::Course;
 use tce_run::error::{Error, Result};
 use tce_run::inputs::{Behaviour, DataArgs, Inputs};
@@ -14,7 +14,7 @@ use tce_run::layers::ConfigArgs;
 use tce_run::off_policy_evaluation::OffPolicyEvaluator;
 use tce_run::pipeline::{Summary, run, seeds};
 use tce_run::variant::Variant;
-use tce_run::verdict::{Candidate, Kept, keep, only, recommend};
+use tce_run::verdict::{Candidate, Kept, keep, recommend_or_only};
 
 use crate::conclusion::{self, Scored};
 use crate::output::{Output, heading, mark_best, table};
@@ -131,9 +131,8 @@ impl Run {
         let mut course = Course::new(self.task.agent, seeds, device, &self.data.out);
         course.step("data", serde_json::json!(self.task));
         for ((variant, _), config) in variants.iter().zip(configs) {
-            let mixed = config.mixture.generated != GeneratedRows::None || config.mixture.source != SourceRows::None;
             course.generating(config);
-            course.learning(variant.name(), config, mixed);
+            course.learning(variant.name(), config, config.mixture.has_other_rows());
         }
         if !self.no_verdict {
             course.verdict(&configs[0]);
@@ -147,8 +146,7 @@ impl Run {
             |row: &Row| Candidate { name: row.title.clone(), baseline: row.baseline, files: row.summary.policies() };
         let evaluator = || OffPolicyEvaluator::train(inputs, dynamics, &self.data.out, device);
         let candidates: Vec<_> = rows.iter().map(candidate).collect();
-        // The simulator has estimates a single policy already.
-        let verdict = only(&candidates).map_or_else(|| recommend(evaluator, &candidates, None), Ok)?;
+        let verdict = recommend_or_only(evaluator, &candidates)?;
         keep(verdict, &self.data.out.join(self.task.directory()))
     }
 }

@@ -7,7 +7,6 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use tce_augment::config::Length;
 use tce_run::config::{Algorithm, Config, GeneratedRows, SourceRows};
 use tce_run::error::Result;
 use tce_run::sweep::{Entry, Kind, Manifest};
@@ -69,20 +68,16 @@ impl Rates {
     }
 
     fn augmentation(&mut self, config: &Config) -> Result<f64> {
-        // A network that trains until it is done is taken to need all that it may.
-        let steps = |length: Length, limit: u64| match length {
-            Length::Steps(steps) => steps as f64,
-            Length::Auto => limit as f64,
-        };
         let g = &config.generator;
         Ok(match config.mixture.generated {
             GeneratedRows::None => self.seconds("labels", config.labels.training.steps as f64)?,
             GeneratedRows::Tce => {
-                let updates = steps(g.state_steps, g.until_done.state_limit)
-                    + steps(g.transition_steps, g.until_done.transition_limit);
+                // A network that trains until it is done is taken to need all that it may.
+                let updates = g.state_steps.most(g.until_done.state_limit)
+                    + g.transition_steps.most(g.until_done.transition_limit);
                 let rows =
                     if g.rows == 0 { (1.0 - config.mixture.lambda) * config.source.rows as f64 } else { g.rows as f64 };
-                self.seconds("score-train", updates)?
+                self.seconds("score-train", updates as f64)?
                     + self.seconds("labels", config.labels.training.steps as f64)?
                     + self.seconds("sample", 2.0 * rows)?
             }
@@ -95,8 +90,7 @@ impl Rates {
 
     fn training(&mut self, config: &Config) -> Result<f64> {
         let learner = &config.learner;
-        let mixed = config.mixture.generated != GeneratedRows::None || config.mixture.source != SourceRows::None;
-        let steps = learner.steps(mixed) as f64;
+        let steps = learner.steps(config.mixture.has_other_rows()) as f64;
         Ok(match learner.algorithm {
             // The workload is one clone of two layers.
             Algorithm::Bc => {
@@ -126,18 +120,17 @@ pub(super) fn costs(manifest: &Manifest) -> Result<Vec<TierCost>> {
     tce_sim::open_library()?;
     let mut rates = Rates { on: On { device: tce_nn::cpu(), seeds: 1 }, known: BTreeMap::new() };
     let mut configs: BTreeMap<&str, Config> = BTreeMap::new();
-    let mut tiers: Vec<TierCost> = Vec::new();
+    let tier = |name: &str| TierCost { tier: name.to_owned(), pieces: 0, core_hours: 0.0 };
+    let mut tiers: Vec<TierCost> = manifest.tiers().into_iter().map(tier).collect();
     for entry in &manifest.entries {
         if !configs.contains_key(entry.config.as_str()) {
             configs.insert(&entry.config, manifest.config(entry)?);
         }
         let seconds = rates.piece(entry, &configs[entry.config.as_str()])?;
-        let at = tiers.iter().position(|t| t.tier == entry.tier).unwrap_or_else(|| {
-            tiers.push(TierCost { tier: entry.tier.clone(), pieces: 0, core_hours: 0.0 });
-            tiers.len() - 1
-        });
-        tiers[at].pieces += 1;
-        tiers[at].core_hours += seconds / 3600.0;
+        for tier in tiers.iter_mut().filter(|t| t.tier == entry.tier) {
+            tier.pieces += 1;
+            tier.core_hours += seconds / 3600.0;
+        }
     }
     Ok(tiers)
 }
