@@ -20,10 +20,11 @@ ActionRange = Union[tuple[float, float], Sequence[tuple[float, float]], None]
 
 
 class Settings:
-    """Preset, file and changed keys."""
+    """Preset, file and changed keys, and what computes the networks."""
 
-    def __init__(self, preset: str, config: Config) -> None:
+    def __init__(self, preset: str, config: Config, device: str) -> None:
         self.preset = preset
+        self.device = device
         self.config: Path | None = None
         self.sets: list[str] = []
         if isinstance(config, Mapping):
@@ -33,7 +34,7 @@ class Settings:
 
     def changed(self, **keys: Any) -> Settings:
         """The same settings with further keys changed; ``generator__rows`` stands for ``generator.rows``."""
-        other = Settings(self.preset, self.config)
+        other = Settings(self.preset, self.config, self.device)
         more = [f"{key.replace('__', '.')}={_toml(value, key)}" for key, value in keys.items()]
         other.sets = [*self.sets, *more]
         return other

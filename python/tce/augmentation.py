@@ -104,6 +104,7 @@ def augment(
     step_limit: int | None = None,
     action_range: ActionRange = None,
     cache: str | os.PathLike[str] = "runs",
+    device: str = "cpu",
     progress: Progress = None,
 ) -> Augmented:
     """Learns from many transitions of the old robot and few of the changed one to generate more of the changed one.
@@ -124,6 +125,9 @@ def augment(
         The actions' range; by default that of the data, where they leave [-1, 1].
     cache : path-like
         Where trained networks and checkpoints are kept. The same call again takes them from there, and an interrupted one continues.
+    device : {"cpu", "vulkan"}
+        What computes the networks. A GPU needs a package that was built for it (docs/gpu.md); its numbers differ from the CPU's by
+        rounding.
     progress
         See :data:`tce.Progress`.
 
@@ -140,7 +144,7 @@ def augment(
     """
     tables = [load(data, env=env, step_limit=step_limit, name=name) for data, name in ((source, "source"), (target, "target"))]
     call = {
-        "settings": Settings(preset, config),
+        "settings": Settings(preset, config, device),
         "robot": Robot(env, step_limit, action_range),
         "seed": seed,
         "cache": Path(cache),

@@ -94,6 +94,7 @@ def run(
     baselines: bool = True,
     verdict: bool = True,
     out: str = "runs",
+    device: str = "cpu",
     progress: Progress = None,
 ) -> BenchmarkRun:
     """The whole job on a task of the benchmark: collects data, generates rows, learns policies, tries them. Needs MuJoCo (``tce[sim]``).
@@ -106,7 +107,7 @@ def run(
         The methods; ``["tce-og"]`` by default.
     seeds, seed : int
         How many seeds, and the first one.
-    preset, config
+    preset, config, device
         See :func:`tce.augment`.
     baselines : bool
         Whether the simple methods stand beside.
@@ -115,8 +116,8 @@ def run(
     out : str
         The folder of runs. What is there is taken from it.
     """
-    settings = Settings(preset, config)
-    arguments = ["run", task, "--seeds", str(seeds), "--seed", str(seed), "--preset", preset, "--out", str(out)]
+    settings = Settings(preset, config, device)
+    arguments = ["--device", device, "run", task, "--seeds", str(seeds), "--seed", str(seed), "--preset", preset, "--out", str(out)]
     if variants:
         arguments += ["--variant", ",".join(variants)]
     if settings.config is not None:

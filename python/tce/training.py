@@ -107,6 +107,7 @@ def train(
     action_range: ActionRange = None,
     out: str | os.PathLike[str] | None = None,
     callback: Callback | None = None,
+    device: str = "cpu",
     progress: Progress = None,
 ) -> TrainingRun:
     """Trains policies, and recommends one without a simulator.
@@ -128,7 +129,7 @@ def train(
         How many policies, and the first seed.
     compare : bool
         Train a baseline beside the policies (clones of the target rows alone), try all of them in learned dynamics, and recommend one.
-    preset, config, env, step_limit, action_range, progress
+    preset, config, env, step_limit, action_range, device, progress
         See :func:`tce.augment`. With ``env`` the policies are tried in the benchmark's simulator as well.
     out : path-like, optional
         The folder for policies, metrics and checkpoints; the same call again takes the results from there. By default a temporary one,
@@ -166,7 +167,7 @@ def train(
     bars, call = chosen(progress)
     reader = MetricsReader(folder / "metrics.jsonl", callback)
     attended = (bars, call if callback is None else reader.beside(call))
-    text = _tce.train(tables, wanted, Settings(preset, config), robot, folder, attended)
+    text = _tce.train(tables, wanted, Settings(preset, config, device), robot, folder, attended)
     reader.read()
     return TrainingRun(json.loads(text), folder, keep)
 

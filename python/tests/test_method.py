@@ -33,7 +33,7 @@ def tce_command(*arguments: str, cwd: Path) -> str:
 def sets() -> list[str]:
     from tce._settings import Settings
 
-    return [word for key in Settings("default", TINY).sets for word in ("--set", key)]
+    return [word for key in Settings("default", TINY, "cpu").sets for word in ("--set", key)]
 
 
 def test_rows_are_those_of_the_command_line(source, target, wider, tmp_path):
@@ -89,6 +89,7 @@ def test_a_temporary_folder_goes_with_the_result(target):
         (dict(config={"learner.step": 3}), "learner.step"),
         (dict(config={"learner": {"steps": "many"}}), "learner.steps"),
         (dict(preset="fast"), 'found "fast", expected one of'),
+        (dict(device="cuda"), 'found "cuda", expected one of cpu, vulkan'),
         (dict(learner="iqll"), "did you mean `iql`"),
         (dict(learner="dara"), "extra="),
         (dict(seeds=0), "at least 1"),

@@ -34,11 +34,12 @@ pub fn augment(
 ) -> PyResult<(Table, String)> {
     let Call { settings, robot, seed, cache } = call;
     let (config, own): (Config, Own) = (settings.config().or_raise(py)?, robot.own().or_raise(py)?);
+    let device = settings.device().or_raise(py)?;
     let (source, target) = (source.rows.clone(), target.rows.clone());
     let augmented = attended(py, progress, move || {
         tce_base::ensure_folder(&cache)?;
         let inputs = Inputs::of_rows(Some(source), target, None, &own)?.with_target_rows(config.target.rows);
-        Augmented::new(&inputs, &config, seed, &cache, &tce_nn::cpu())
+        Augmented::new(&inputs, &config, seed, &cache, &device)
     })?;
     let report = serde_json::json!({ "report": augmented.report, "attributes": augmented.attributes });
     Ok((Table::of(augmented.generated), report.to_string()))

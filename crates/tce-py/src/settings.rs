@@ -3,17 +3,20 @@
 use pyo3::prelude::*;
 use tce_base::did_you_mean;
 use tce_data::parse_environment;
+use tce_nn::Device;
 use tce_run::config::{Algorithm, Config};
+use tce_run::device_kind::DeviceKind;
 use tce_run::layers::{ConfigArgs, Preset};
 use tce_run::own::{Own, parse_range};
 use tce_run::{Error, Result};
 
-/// A preset, a file of changed keys, and `KEY=VALUE` in TOML's words.
+/// A preset, a file of changed keys, `KEY=VALUE` in TOML's words, and what computes the networks.
 #[derive(FromPyObject)]
 pub struct Settings {
     preset: String,
     config: Option<std::path::PathBuf>,
     sets: Vec<String>,
+    device: String,
 }
 
 /// One of an enumeration of the command line by its name.
@@ -30,6 +33,11 @@ impl Settings {
     fn arguments(&self) -> Result<ConfigArgs> {
         let preset: Preset = named("preset", &self.preset)?;
         Ok(ConfigArgs { preset, config: self.config.clone(), sets: self.sets.clone() })
+    }
+
+    /// What computes the networks.
+    pub fn device(&self) -> Result<Device> {
+        named::<DeviceKind>("device", &self.device)?.device()
     }
 
     /// The whole configuration.

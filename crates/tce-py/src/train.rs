@@ -40,7 +40,7 @@ pub fn train(
 ) -> PyResult<String> {
     let (target, extra, source) = tables;
     let config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
-    let own = robot.own().or_raise(py)?;
+    let (own, device) = (robot.own().or_raise(py)?, settings.device().or_raise(py)?);
     let seeds = counted(wanted.first_seed, wanted.seeds).or_raise(py)?;
     ensure_fits(&config.learner, extra.is_some()).or_raise(py)?;
     let comparison = if wanted.compare { Comparison::Recommend } else { Comparison::Skip };
@@ -53,7 +53,7 @@ pub fn train(
         let inputs = Inputs::of_rows(source, target, extra, &own)?;
         let inputs = inputs.with_target_rows(config.target.rows);
         let run = TrainingRun { config: &config, seeds: &seeds, own: &own, comparison, out: &out };
-        run.run(&inputs, &tce_nn::cpu())
+        run.run(&inputs, &device)
     })?;
     Ok(serde_json::to_string(&trained).expect("plain data"))
 }

@@ -4,6 +4,7 @@ pub mod allocator;
 mod bench;
 mod commands;
 mod conclusion;
+mod costs;
 #[cfg(test)]
 mod fuzz;
 mod output;

@@ -16,6 +16,19 @@ pub fn told(error: &dyn Error) -> String {
     laid_out(error, width).replacen('×', &style('×').for_stderr().red().to_string(), 1)
 }
 
+/// The text of clap for a wrong call, wrapped on a terminal: clap wraps its help, but not its errors.
+pub fn wrong_call(error: &clap::Error) -> String {
+    let styled = error.render();
+    let text = if console::colors_enabled_stderr() { styled.ansi().to_string() } else { styled.to_string() };
+    Term::stderr().size_checked().map_or(text.clone(), |(_, columns)| wrapped(&text, usize::from(columns).max(40)))
+}
+
+/// Every line of `text` in at most `width` columns; further lines stand as deep as their first.
+fn wrapped(text: &str, width: usize) -> String {
+    let depth = |line: &str| line.len() - line.trim_start().len();
+    text.lines().map(|line| break_line(line, depth(line), width) + "\n").collect()
+}
+
 fn laid_out(error: &dyn Error, width: usize) -> String {
     // A line that is indented is a command or a path, to be copied whole.
     let lines = |line: &str| match line.starts_with("  ") {
@@ -39,6 +52,15 @@ mod tests {
     fn an_error_is_told_once() {
         let error = Told("it failed: no space\nDo this.", Some(Box::new(Told("no space", None))));
         assert_eq!(laid_out(&error, 80), "  × it failed: no space\n    Do this.\n");
+    }
+
+    #[test]
+    fn a_wrong_call_is_wrapped_between_words() {
+        assert_eq!(
+            wrapped("error: one two\n\n  tip: three four\n", 10),
+            "error: one\ntwo\n\n  tip:\n  three\n  four\n"
+        );
+        assert_eq!(wrapped("\u{1b}[1merror:\u{1b}[0m one two", 14), "\u{1b}[1merror:\u{1b}[0m one two\n");
     }
 
     #[test]

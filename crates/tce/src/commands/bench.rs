@@ -11,6 +11,7 @@ use tce_run::error::{Error, Result};
 use tce_run::layers::{Layered, Preset};
 
 use crate::bench::{Measured, On, measure, names, simulates};
+use crate::costs::Rates;
 use crate::output::{Output, table};
 
 /// Arguments of `bench`.
@@ -48,14 +49,16 @@ struct Report {
     whole_task: Option<WholeTask>,
 }
 
-/// Seconds that the `default` preset takes for one seed at the paper's size: 1M generated rows and 1M updates.
+/// Seconds of one core that TCE(OG) of the `default` preset takes for one seed, and its best baseline.
 #[derive(Serialize)]
 struct WholeTask {
-    score_training: f64,
-    label_models: f64,
-    sampling: f64,
-    behaviour_model: f64,
+    /// Score networks, label models and sampling. Networks that train until they are done are taken to need all that they may.
+    generated_rows: f64,
     policy: f64,
+    /// The ensemble of clones of the target's rows.
+    baseline: f64,
+    /// The dynamics that policies are tried in.
+    verdict: f64,
     total: f64,
 }
 
@@ -89,7 +92,10 @@ impl Bench {
             instructions: tce_nn::instructions(),
             threads: rayon::current_num_threads(),
             core_gflops,
-            whole_task: if kind == DeviceKind::Cpu && self.seeds == 1 { whole_task(&workloads)? } else { None },
+            whole_task: match (kind, self.seeds, self.workloads.is_empty()) {
+                (DeviceKind::Cpu, 1, true) => Some(whole_task(&workloads)?),
+                _ => None,
+            },
             workloads,
         };
         if let Some(path) = &self.out {
@@ -100,27 +106,14 @@ impl Bench {
     }
 }
 
-fn whole_task(measured: &[Measured]) -> Result<Option<WholeTask>> {
-    let rate = |name: &str| measured.iter().find(|m| m.name == name).map(|m| m.per_second);
-    let config = Layered::new(Preset::Default, None, None, None, &[])?.config()?;
-    let g = &config.generator;
-    let (Some(score), Some(sample), Some(labels), Some(cvae), Some(iql)) =
-        (rate("score-train"), rate("sample"), rate("labels"), rate("cvae"), rate("iql-kl"))
-    else {
-        return Ok(None);
-    };
-    // Two threads train the two networks side by side.
-    // A network that trains until it is done takes as long as its limit at most.
-    let (a, b) = (
-        g.state_steps.most(g.until_done.state_limit) as f64 / score,
-        g.transition_steps.most(g.until_done.transition_limit) as f64 / score,
-    );
-    let score_training = if rayon::current_num_threads() > 1 { a.max(b) } else { a + b };
-    let (label_models, behaviour_model) =
-        (config.labels.training.steps as f64 / labels, config.learner.behaviour.cvae.steps as f64 / cvae);
-    let (sampling, policy) = (2.0 * 1e6 / sample, 1e6 / iql);
-    let total = score_training + label_models + sampling + behaviour_model + policy;
-    Ok(Some(WholeTask { score_training, label_models, sampling, behaviour_model, policy, total }))
+fn whole_task(measured: &[Measured]) -> Result<WholeTask> {
+    let mut rates = Rates::new(measured);
+    let config = |set: &[String]| Layered::new(Preset::Default, None, None, None, set)?.config();
+    let (own, baseline) = (config(&[])?, config(&["mixture.generated=\"none\"".into()])?);
+    let (generated_rows, verdict) = (rates.augmentation(&own)?, rates.dynamics(&own)?);
+    let (policy, baseline) = (rates.training(&own)?, rates.training(&baseline)?);
+    let total = generated_rows + policy + baseline + verdict;
+    Ok(WholeTask { generated_rows, policy, baseline, verdict, total })
 }
 
 fn render(report: &Report) -> String {
@@ -139,24 +132,26 @@ fn render(report: &Report) -> String {
     });
     let header = ["workload", "rate", "range", "GFLOP/s", "of the cores' own"];
     let mut text = format!(
-        "{}, {}, {} threads, {:.1} GFLOP/s a core in 256 x 256 products\n{}\n",
+        "{}, {}, {}, {:.1} GFLOP/s a core in 256 x 256 products\n{}\n",
         report.processor,
         report.instructions,
-        report.threads,
+        match report.threads {
+            1 => "1 thread".to_owned(),
+            n => format!("{n} threads"),
+        },
         report.core_gflops,
         table(&header, rows)
     );
     if let Some(t) = &report.whole_task {
         let minutes = |s: f64| s / 60.0;
         text += &format!(
-            "a whole default task, one seed, 1M rows generated, 1M updates: {:.0} min (score networks {:.1}, labels {:.1}, \
-             sampling {:.1}, behaviour model {:.1}, policy {:.1})\n",
+            "TCE(OG) of the default preset, one seed, one core: {:.0} min at most (generated rows {:.1}, policy {:.1}, baseline {:.1}, verdict \
+             {:.1})\n",
             minutes(t.total),
-            minutes(t.score_training),
-            minutes(t.label_models),
-            minutes(t.sampling),
-            minutes(t.behaviour_model),
-            minutes(t.policy)
+            minutes(t.generated_rows),
+            minutes(t.policy),
+            minutes(t.baseline),
+            minutes(t.verdict)
         );
     }
     text

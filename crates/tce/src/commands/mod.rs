@@ -102,9 +102,15 @@ impl Cli {
         help::described(Self::command())
     }
 
-    /// What the user asked for. Help, versions and wrong calls end the process here, by clap's own hand: a wrong call with exit code 2.
+    /// What the user asked for. Help, versions and wrong calls end the process here: a wrong call with exit code 2.
     pub fn of_command_line() -> Self {
-        Self::of(std::env::args_os()).unwrap_or_else(|e| e.exit())
+        Self::of(std::env::args_os()).unwrap_or_else(|error| {
+            if !error.use_stderr() {
+                error.exit();
+            }
+            eprint!("{}", crate::told::wrong_call(&error));
+            std::process::exit(error.exit_code())
+        })
     }
 
     /// The call `arguments`, the first of which is the program's name.
