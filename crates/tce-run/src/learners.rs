@@ -161,6 +161,11 @@ impl LearnerConfig {
         self.own().steps(self.steps, mixed)
     }
 
+    /// The step from which on only target rows are learned from, where `mixed` batches begin with others.
+    pub fn fade(&self, mixed: bool) -> Option<u64> {
+        self.own().fade(self.steps(mixed)).filter(|_| mixed)
+    }
+
     /// Rows of each update.
     pub fn batch(&self) -> usize {
         self.own().batch(self.batch)

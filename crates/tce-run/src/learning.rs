@@ -168,7 +168,8 @@ fn job(
     device: &Device,
 ) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
     let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
-    let buffer = Buffer::new(members, config.batch())?;
+    let mixed = data.iter().any(|d| d.extra.is_some());
+    let buffer = Buffer::new(members, config.batch())?.fading(config.fade(mixed));
     let learner = build(&buffer, config, place, device)?;
     Ok((buffer, learner))
 }

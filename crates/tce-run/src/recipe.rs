@@ -41,7 +41,8 @@ fn flat(table: &toml::Table, prefix: &str, out: &mut BTreeMap<String, String>) {
 
 /// Settings that a configuration leaves out where they have these values, because they came later than it: keys of finished runs are
 /// hashes of the text.
-const LEFT_OUT: [(&str, &str); 5] = [
+const LEFT_OUT: [(&str, &str); 6] = [
+    ("learner.bc.fade", "0.0"),
     ("learner.bc.dropout", "0.0"),
     ("learner.bc.batch", "0"),
     ("learner.bc.loss", "\"squared\""),

@@ -10,6 +10,7 @@
 //! | - | `batch` | 0 | own: rows of each update; 0: `learner.batch` |
 //! | E | `ensemble` | 1 | own: policies whose outputs are averaged before the tanh |
 //! | - | `mixed_steps` | 0 | own: generated rows are fitted sooner than they are right, see below |
+//! | - | `fade` | 0 | own: other rows first, the target's alone at last |
 //! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
 //!
 //! Behaviour policies are sampled. A network that fits 5000 noisy actions exactly therefore fits their noise: on
@@ -64,6 +65,7 @@ impl Method for BcConfig {
 
     fn check(&self) -> Result<(), LearnError> {
         within("dropout", self.dropout, 0.0..=0.9)?;
+        within("fade", self.fade, 0.0..=1.0)?;
         within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
         if self.ensemble > 1 && self.loss == CloneLoss::Squared && self.actor.form != PolicyForm::TanhMean {
             let (found, remedy) =
@@ -79,6 +81,10 @@ impl Method for BcConfig {
 
     fn batch(&self, batch: usize) -> usize {
         if self.batch == 0 { batch } else { self.batch }
+    }
+
+    fn fade(&self, steps: u64) -> Option<u64> {
+        (self.fade > 0.0).then(|| (self.fade * steps as f64).round() as u64)
     }
 
     fn steps(&self, steps: u64, mixed: bool) -> u64 {
@@ -105,6 +111,11 @@ pub struct BcConfig {
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
     /// as without them.
     pub mixed_steps: u64,
+    /// Share of the steps after which only target rows are cloned. The other rows' share of a batch falls linearly until then. 0: half of
+    /// every batch, to the end.
+    #[serde(skip_serializing_if = "no_fade")]
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub fade: f64,
     /// Rows of each update. 0: `learner.batch`.
     #[serde(skip_serializing_if = "is_zero")]
     pub batch: usize,
@@ -120,6 +131,7 @@ impl Default for BcConfig {
             ensemble: 1,
             dropout: 0.0,
             mixed_steps: 0,
+            fade: 0.0,
             batch: 0,
             loss: CloneLoss::Squared,
         }
@@ -129,6 +141,11 @@ impl Default for BcConfig {
 // The cache keys of runs from before this key was added do not contain it.
 fn is_zero(batch: &usize) -> bool {
     *batch == 0
+}
+
+// The cache keys of runs from before this key was added do not contain it.
+fn no_fade(share: &f64) -> bool {
+    *share == 0.0
 }
 
 // The cache keys of runs from before dropout was added do not contain it.

@@ -153,6 +153,12 @@ pub trait Method {
         steps
     }
 
+    /// The step from which on only target rows are learned from, of `steps`; None: other rows are, to the end.
+    fn fade(&self, steps: u64) -> Option<u64> {
+        let _ = steps;
+        None
+    }
+
     /// Rows of each update, where `batch` were asked for.
     fn batch(&self, batch: usize) -> usize {
         batch

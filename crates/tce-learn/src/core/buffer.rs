@@ -46,6 +46,8 @@ pub struct Buffer {
     act_dim: usize,
     /// The name of the random stream for batches.
     stream: &'static str,
+    /// The step from which on batches hold target rows alone.
+    fade: Option<u64>,
 }
 
 /// The origin of a batch entry.
@@ -160,12 +162,31 @@ impl Buffer {
         // A dimension that is constant in the data of every member would only cost time (Ant's 84 contact slots).
         let live = |d: &usize| members.iter().any(|m| !m.standardizer.dead.contains(d));
         let inputs = (0..dims.0).filter(live).collect();
-        Ok(Self { members, batch, inputs, act_dim: dims.1, stream: "batch" })
+        Ok(Self { members, batch, inputs, act_dim: dims.1, stream: "batch", fade: None })
     }
 
     /// The same with batches from another stream: two learners with one seed must not draw the same rows at every step.
     pub fn with_stream(self, stream: &'static str) -> Self {
         Self { stream, ..self }
+    }
+
+    /// The same, where the other parts' share of a batch falls linearly from its whole at step 0 to nothing at step
+    /// `until`. Their places go to the target.
+    pub fn fading(self, until: Option<u64>) -> Self {
+        Self { fade: until, ..self }
+    }
+
+    /// Rows of each of `parts` in the batch of `step`.
+    fn split(&self, step: u64, parts: &[Arc<Transitions>]) -> Vec<usize> {
+        let mut rows = split(self.batch, parts);
+        let Some(until) = self.fade.filter(|until| *until > 0) else { return rows };
+        let left = until.saturating_sub(step);
+        for k in 1..rows.len() {
+            let kept = (rows[k] as u64 * left).div_ceil(until) as usize;
+            rows[0] += rows[k] - kept;
+            rows[k] = kept;
+        }
+        rows
     }
 
     /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent. Observations
@@ -175,7 +196,7 @@ impl Buffer {
         let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
         let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
         let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
-        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream: "batch" }
+        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream: "batch", fade: None }
     }
 
     /// The table of a replay buffer, to add rows to.
@@ -231,7 +252,7 @@ impl Buffer {
         let mut target_rows = b;
         for member in &self.members {
             let mut rng = member.streams.indexed(self.stream, step);
-            let split = split(b, &member.parts);
+            let split = self.split(step, &member.parts);
             target_rows = target_rows.min(split[0]);
             for (k, (part, &rows)) in member.parts.iter().zip(&split).enumerate() {
                 for _ in 0..rows {
