@@ -14,6 +14,7 @@ pub mod sealed;
 pub mod statistics;
 pub mod terminal;
 pub mod words;
+pub mod wrap;
 
 pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
 pub use files::{

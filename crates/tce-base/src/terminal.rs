@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{LazyLock, PoisonError, RwLock};
 use std::time::Instant;
 
-use console::style;
+use console::{Term, style};
 use indicatif::MultiProgress;
 
 /// All lines that change in place. They have one writer, so that bars side by side and notes between them leave no line behind.
@@ -46,6 +46,8 @@ pub fn say(text: &str) {
     if let Some(listener) = &*LISTENER.read().unwrap_or_else(PoisonError::into_inner) {
         return listener(text);
     }
+    let columns = Term::stderr().size_checked().map(|(_, columns)| usize::from(columns)).filter(|_| in_place());
+    let text = columns.map_or_else(|| text.to_owned(), |columns| crate::wrap::text(text, columns.max(40)));
     let print = || match text.strip_prefix("warning:") {
         Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
         None => eprintln!("{text}"),

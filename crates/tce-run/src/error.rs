@@ -61,6 +61,14 @@ impl Error {
         Interrupted::resumable().into()
     }
 
+    /// This error of a command that keeps what it has finished: wherever an interrupt met it, the same command goes on.
+    pub fn of_resumable(self) -> Self {
+        match self {
+            Error::Interrupted(_) => Self::interrupted(),
+            other => other,
+        }
+    }
+
     /// 2 for a wrong call, 130 after an interrupt, 1 for the rest.
     pub fn exit_code(&self) -> i32 {
         match self {

@@ -160,9 +160,9 @@ impl Cli {
         };
         let output = Output { form, into };
         match self.command {
-            Command::Run(args) => args.run(output, &device()?),
-            Command::Augment(args) => args.run(output, &device()?),
-            Command::Learn(args) => args.run(output, &device()?),
+            Command::Run(args) => args.run(output, &device()?).map_err(Error::of_resumable),
+            Command::Augment(args) => args.run(output, &device()?).map_err(Error::of_resumable),
+            Command::Learn(args) => args.run(output, &device()?).map_err(Error::of_resumable),
             Command::Evaluate(args) => args.run(output),
             Command::Export(args) => args.run(output),
             Command::Compare(args) => args.run(output, &device()?),

@@ -7,10 +7,9 @@ use serde::Serialize;
 
 mod csv;
 mod table;
-mod wrap;
 
 pub use table::{heading, list, mark_best, table};
-pub use wrap::{break_line, prose};
+pub use tce_base::wrap::{break_line, prose};
 
 /// The form of the results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,7 +53,7 @@ impl Output<'_> {
 
 /// `text` with lines no longer than they may be.
 pub fn fit(text: &str) -> String {
-    width().map_or_else(|| text.to_owned(), |width| wrap::text(text, width))
+    width().map_or_else(|| text.to_owned(), |width| tce_base::wrap::text(text, width))
 }
 
 /// The columns that a line may have: `COLUMNS`, else the terminal's; None where results go to a file or a pipe, whose lines may be as long

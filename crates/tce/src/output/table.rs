@@ -7,7 +7,7 @@ use comfy_table::presets::UTF8_FULL_CONDENSED;
 use comfy_table::{Attribute, Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Table, Width};
 use console::measure_text_width;
 
-use super::wrap::break_line;
+use tce_base::wrap::break_line;
 
 /// Stands before a cell that is the best of its kind; a character that no text has.
 const BEST: char = '\u{e000}';

@@ -83,3 +83,19 @@ fn what_the_zoo_lacks_is_said_before_anything_is_computed() {
     assert!(message.contains("the zoo has no actors"), "{message}");
     assert!(!dir.path().join("x.hdf5").exists());
 }
+
+/// Every task of the paper with medium source data, and Ant under five times its gravity, on a machine that has the program alone.
+#[test]
+fn the_zoo_has_the_data_of_every_target() {
+    let dir = tempfile::tempdir().unwrap();
+    let description = r#"
+        tasks = ["*-morph/medium/*", "*-kinematic/medium/*", "*-gravity/medium/*", "ant-gravity-5/medium/medium"]
+        variants = ["bc"]
+        baselines = false
+        from_zoo = true
+    "#;
+    fs::write(dir.path().join("all.toml"), description).unwrap();
+    let planned = tce_json(dir.path(), &["sweep", "plan", "all.toml", "--dry-run"]);
+    // Three shifts, four robots, three qualities; and one.
+    assert_eq!(planned["target"], 37, "{planned}");
+}
