@@ -1,6 +1,7 @@
 //! The base of all crates: named random streams, files that are whole or absent, and long work that shows its progress and can be
 //! interrupted.
 
+pub mod checked;
 pub mod course;
 pub mod files;
 pub mod format;
@@ -15,6 +16,7 @@ pub mod statistics;
 pub mod terminal;
 pub mod words;
 
+pub use checked::{Damage, JsonError, read_json, sha256_files, verify_sha256};
 pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
 pub use files::{
     AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
