@@ -460,6 +460,7 @@ mod tests {
         assert!(serde_json::to_value(&new).unwrap().get("joint").is_some(), "what keys are hashed from");
     }
 
+        assert_eq!(new.to_toml(), keyed.replace("\n[joint", "\n[single_stage"), "nothing else differs");
     #[test]
     fn mistakes_are_named() {
         let message = |sets: &[&str]| match layered(Preset::Default, None, sets).and_then(|l| l.config()) {
