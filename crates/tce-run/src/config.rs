@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
 use tce_data::ScoreTable;
-use tce_learn::{DynamicsConfig, FittedQConfig, RowScores};
+use tce_learn::{DynamicsConfig, FittedQConfig, LearnedRows, RowScores};
 
 use crate::error::{Error, Result};
 pub use crate::learners::{Algorithm, LearnerConfig};
@@ -195,9 +195,12 @@ pub struct MixtureConfig {
 }
 
 impl MixtureConfig {
-    /// Whether rows besides the target's join it.
-    pub fn has_other_rows(&self) -> bool {
-        self.generated != GeneratedRows::None || self.source != SourceRows::None
+    /// Whether rows besides the target's are learned from.
+    pub fn learned_rows(&self) -> LearnedRows {
+        match (self.generated, self.source) {
+            (GeneratedRows::None, SourceRows::None) => LearnedRows::Target,
+            _ => LearnedRows::Mixed,
+        }
     }
 }
 

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use tce_base::sha256_file;
 use tce_data::Agent;
-use tce_learn::PolicyKind;
 use tce_learn::sac::Sac;
+use tce_learn::{Learner, PolicyKind};
 use tce_nn::NamedParameters;
 
 use super::ledger::{Ledger, verify};

@@ -133,7 +133,7 @@ impl Run {
         course.step("data", serde_json::json!(self.task));
         for ((variant, _), config) in variants.iter().zip(configs) {
             course.generating(config);
-            course.learning(variant.name(), config, config.mixture.has_other_rows());
+            course.training(variant.name(), config, config.mixture.learned_rows());
         }
         if !self.no_verdict {
             course.verdict(&configs[0]);
