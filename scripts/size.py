@@ -23,9 +23,6 @@ ALLOWED = {
     "crates/tce-nn/src/gemm/kernel.rs: fn tiles()": KERNEL,
     "crates/tce-nn/src/kernels.rs: fn backward()": KERNEL,
     "crates/tce-nn/src/stack.rs: fn block()": KERNEL,
-    "crates/tce-zoo/src/sac_training.rs": "one training with its ledger; to be cut where its checkpoints become those of other trainings",
-    "crates/tce-zoo/src/sac_training.rs: fn open": "as the file",
-    "crates/tce/src/commands/train_sac.rs: fn run": "as sac_training.rs, whose settings it fills",
 }
 
 

@@ -258,7 +258,7 @@ impl SingleStage {
         let request = Request {
             start: first.as_deref(),
             kept: work.keeper.chunks(),
-            ..request(&condition, config, under.is_some())
+            ..request(&condition, config, Under::of(scores))
         };
         let bar = progress("sample transitions", n * members.len(), &config.sampler);
         let sampled = self.model.sample(request, &config.sampler, &members, Some(&bar))?;
@@ -278,15 +278,31 @@ impl SingleStage {
     }
 }
 
+/// What rows are drawn under.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Under {
+    /// Nothing (SynthER).
+    Nothing,
+    /// Scores, with guidance (DmC).
+    Scores,
+}
+
+impl Under {
+    /// `scores`, if there are any.
+    pub fn of<T: ?Sized>(scores: Option<&T>) -> Self {
+        if scores.is_some() { Self::Scores } else { Self::Nothing }
+    }
+}
+
 /// What is asked of the network, without where it starts and what is kept.
-fn request<'a>(condition: &'a [f32], config: &SingleStageConfig, guided: bool) -> Request<'a> {
-    let guidance = guided.then_some(config.guidance.weight).filter(|w| *w != 1.0);
+fn request<'a>(condition: &'a [f32], config: &SingleStageConfig, under: Under) -> Request<'a> {
+    let guidance = (under == Under::Scores).then_some(config.guidance.weight).filter(|w| *w != 1.0);
     Request { name: "joint", rows: config.rows, condition, guidance, start: None, kept: None }
 }
 
 /// Network evaluations for one row; guidance doubles them.
-pub fn evaluations(config: &SingleStageConfig, guided: bool) -> usize {
-    request(&[], config, guided).evaluations(&config.sampler)
+pub fn evaluations(config: &SingleStageConfig, under: Under) -> usize {
+    request(&[], config, under).evaluations(&config.sampler)
 }
 
 /// How the network is trained.

@@ -1,6 +1,5 @@
 //! Files that are either whole or absent: written beside their final place, flushed to disk, then renamed.
 
-use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -212,19 +211,6 @@ fn flush_directory(path: &Path) -> Result<(), FileError> {
     #[cfg(not(unix))]
     let _ = path;
     Ok(())
-}
-
-/// The first of `files` (names below `directory` with their SHA-256) that is missing or changed, and what is wrong; None if all are
-/// intact.
-pub fn first_damaged(directory: &Path, files: &BTreeMap<String, String>) -> Option<String> {
-    files.iter().find_map(|(name, expected)| {
-        let file = directory.join(name);
-        match sha256_file(&file) {
-            Ok(found) if found == *expected => None,
-            Ok(found) => Some(format!("{}: SHA-256 {found}, expected {expected}", file.display())),
-            Err(e) => Some(e.to_string()),
-        }
-    })
 }
 
 /// Gives the complete file `own`, flushed to disk, the name `target` on the same file system, in place of what had it.

@@ -1,6 +1,7 @@
 //! The base of all crates: named random streams, files that are whole or absent, and long work that shows its progress and can be
 //! interrupted.
 
+pub mod checked;
 pub mod course;
 pub mod files;
 pub mod format;
@@ -16,10 +17,11 @@ pub mod terminal;
 pub mod words;
 pub mod wrap;
 
+pub use checked::{Damage, JsonError, first_damaged, read_json, sha256_files, verify_sha256};
 pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
 pub use files::{
-    AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, first_damaged, link_first, move_into_place,
-    read_if_there, sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
+    AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, link_first, move_into_place, read_if_there,
+    sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
 };
 pub use interrupt::{Interrupted, interrupted, listen_for_interrupts, set_interrupted};
 pub use metrics::Metrics;

@@ -166,6 +166,15 @@ pub struct ErrorBin {
     pub error: Spread,
 }
 
+/// What errors of generated rows are against.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Truth {
+    /// The simulator.
+    Simulator,
+    /// Models of the target's rows: how far they are apart.
+    Models,
+}
+
 /// Errors of generated rows over the distance of ŝ to the nearest real target state.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ErrorOverDistance {
@@ -187,7 +196,8 @@ impl ErrorOverDistance {
     const FEWEST: usize = 20;
 
     /// Bins of pairs (distance in standard deviations, error); None without rows, or without a unit above 0.
-    pub fn of(mut rows: Vec<(f64, f64)>, unit: Option<f64>, simulated: bool) -> Option<Self> {
+    pub fn of(mut rows: Vec<(f64, f64)>, unit: Option<f64>, truth: Truth) -> Option<Self> {
+        let simulated = truth == Truth::Simulator;
         let by_episode = unit.is_some();
         let unit = unit.unwrap_or(1.0);
         rows.retain(|(distance, _)| distance.is_finite());
@@ -243,12 +253,12 @@ mod tests {
     #[test]
     fn errors_are_binned_by_their_distance() {
         let rows: Vec<(f64, f64)> = (0..400).rev().map(|i| (f64::from(i), f64::from(i) / 10.0)).collect();
-        let found = ErrorOverDistance::of(rows, Some(2.0), true).unwrap();
+        let found = ErrorOverDistance::of(rows, Some(2.0), Truth::Simulator).unwrap();
         assert_eq!(found.bins.len(), 10);
         assert_eq!((found.bins[0].distance, found.bins[0].error.median), (10.0, 2.0));
         assert!(found.bins.windows(2).all(|w| w[0].distance < w[1].distance && w[0].error.count == 40));
-        assert_eq!(ErrorOverDistance::of(vec![(1.0, 1.0); 5], None, false).unwrap().bins.len(), 1);
-        assert_eq!(ErrorOverDistance::of(vec![], None, false), None);
+        assert_eq!(ErrorOverDistance::of(vec![(1.0, 1.0); 5], None, Truth::Models).unwrap().bins.len(), 1);
+        assert_eq!(ErrorOverDistance::of(vec![], None, Truth::Models), None);
     }
 
     #[test]

@@ -27,6 +27,6 @@ pub use bounds::{Bounds, Choice, Curve, MeanError, Part, Rated};
 pub use coverage::Coverage;
 pub use diagnosis::{AtBound, Diagnosis, Labels, Reliability, Sampled};
 pub use embedding::{Embedding, Group};
-pub use implied::{ErrorOverDistance, Implied, ImpliedActions, ImpliedErrors, ImpliedRollout};
+pub use implied::{ErrorOverDistance, Implied, ImpliedActions, ImpliedErrors, ImpliedRollout, Truth};
 pub use memorisation::{HeldOut, Memorisation, Verdict};
 pub use numbers::{Histogram, Spread};

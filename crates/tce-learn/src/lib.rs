@@ -55,7 +55,7 @@ pub use igdf::{Igdf, IgdfConfig};
 pub use iql::{Iql, IqlConfig, PolicyExtraction};
 pub use labels::{LabelConfig, LabelErrors, LabelModels, Labelled, TerminalHandling, rmse, train_labels};
 pub use meta_dt::{MetaDt, MetaDtConfig};
-pub use method::{About, Built, Method, OtherRows, RowScores, Setup};
+pub use method::{About, Built, LearnedRows, Method, OtherRows, RowScores, Setup};
 pub use mlp_policy::{Head, LOG_STD_RANGE, MlpPolicy, PolicySpec};
 pub use mode::Mode;
 pub use otdf::{Otdf, OtdfConfig};

@@ -147,7 +147,7 @@ impl RunFolder {
                 return Err(ReportError::field(&path, field, format!("{} values", list.len()), expected, AGAIN));
             }
         }
-        let members = (0..seeds.len()).map(|m| member(&done, m, !scores.is_empty(), !evaluations.is_empty()));
+        let members = (0..seeds.len()).map(|m| member(&done, m));
         let generated = done.array("/summary/generated")?;
         let rows = |m: usize, what: &str| {
             done.get(&format!("/summary/generated/{m}/{what}"), "a number of rows", Value::as_u64)
@@ -193,10 +193,12 @@ impl RunFolder {
     }
 }
 
-fn member(done: &Document<'_>, m: usize, scored: bool, evaluated: bool) -> Result<Member> {
+/// Member `m`. The lists of scores and evaluations are empty where nobody evaluated.
+fn member(done: &Document<'_>, m: usize) -> Result<Member> {
+    let filled = |list: &str| done.array(list).map(|l| !l.is_empty());
     let seed = done.get(&format!("/summary/seeds/{m}"), "a whole number from 0", Value::as_u64)?;
     let number = "a finite number, or null where the policy could not be evaluated";
-    let score = match scored {
+    let score = match filled("/summary/scores")? {
         true => done.get(&format!("/summary/scores/{m}"), number, |v| match v {
             Value::Null => Some(None),
             v => v.as_f64().filter(|s| s.is_finite()).map(Some),
@@ -204,6 +206,7 @@ fn member(done: &Document<'_>, m: usize, scored: bool, evaluated: bool) -> Resul
         false => None,
     };
     let at = |rest: &str| format!("/summary/learned/evaluations/{m}/{rest}");
+    let evaluated = filled("/summary/learned/evaluations")?;
     let failed = done.root.pointer(&at("failed")).and_then(Value::as_str).filter(|_| evaluated);
     let returns = match evaluated {
         true => done.get(&at("returns"), "a list of numbers", |v| {

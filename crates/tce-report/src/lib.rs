@@ -6,6 +6,7 @@
 
 pub mod analysis;
 pub mod diagnosis;
+pub mod difference;
 pub mod error;
 pub mod folder;
 pub mod html;

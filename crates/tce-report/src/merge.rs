@@ -1,5 +1,6 @@
 //! Several studies as one: a record of last month beside the sweep of today.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 
 use tce_data::Task;
@@ -23,17 +24,19 @@ pub fn merge(studies: Vec<Study>) -> Study {
     let mut merging = Merging {
         names: vec![first.name.clone()],
         origins: vec![0; first.runs.len()],
+        places: BTreeMap::new(),
         renamed: Vec::new(),
         out: first,
     };
+    for (place, run) in merging.out.runs.iter().enumerate() {
+        merging.places.entry(Work::of(run)).or_insert(place);
+    }
     studies.for_each(|study| merging.join(study));
     merging.split();
     let mut out = merging.out;
     // What one of them lacks another one may have.
-    let done =
-        |m: &Missing| out.runs.iter().any(|r| (r.task, &r.method, Some(r.member.seed)) == (m.task, &m.method, m.seed));
-    let missing = std::mem::take(&mut out.missing);
-    out.missing = missing.into_iter().filter(|m| !done(m)).collect();
+    let done: BTreeSet<_> = out.runs.iter().map(|r| (r.task, r.method.as_str(), Some(r.member.seed))).collect();
+    out.missing.retain(|m| !done.contains(&(m.task, m.method.as_str(), m.seed)));
     out.methods.sort_by_key(|m| !m.baseline);
     out
 }
@@ -43,6 +46,8 @@ struct Merging {
     out: Study,
     /// The study that each run of `out` came from.
     origins: Vec<usize>,
+    /// The place of the first run of every work in `out`.
+    places: BTreeMap<Work, usize>,
     /// The studies' names, each once.
     names: Vec<String>,
     /// Methods that have another id than in their study, because that was taken: as they were, and the new id.
@@ -50,9 +55,25 @@ struct Merging {
 }
 
 /// What makes two runs the same work.
-fn same_work(a: &Run, b: &Run) -> bool {
-    (a.task, &a.method, a.member.seed) == (b.task, &b.method, b.member.seed)
-        && (&a.folder.config_hash, &a.folder.inputs) == (&b.folder.config_hash, &b.folder.inputs)
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+struct Work {
+    task: Task,
+    method: String,
+    seed: u64,
+    config_hash: String,
+    inputs: BTreeMap<String, String>,
+}
+
+impl Work {
+    fn of(run: &Run) -> Self {
+        Self {
+            task: run.task,
+            method: run.method.clone(),
+            seed: run.member.seed,
+            config_hash: run.folder.config_hash.clone(),
+            inputs: run.folder.inputs.clone(),
+        }
+    }
 }
 
 /// The column of `method` for the runs of the study `name`.
@@ -117,10 +138,14 @@ impl Merging {
 
     /// Adds a run of study `number`, unless it is there.
     fn add(&mut self, run: Run, number: usize) {
-        let Some(at) = self.out.runs.iter().position(|r| same_work(r, &run)) else {
-            self.out.runs.push(run);
-            self.origins.push(number);
-            return;
+        let at = match self.places.entry(Work::of(&run)) {
+            Entry::Occupied(known) => *known.get(),
+            Entry::Vacant(new) => {
+                new.insert(self.out.runs.len());
+                self.out.runs.push(run);
+                self.origins.push(number);
+                return;
+            }
         };
         let first = &self.out.runs[at];
         match (&first.member.verdict, &run.member.verdict) {

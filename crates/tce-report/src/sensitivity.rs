@@ -7,7 +7,7 @@ use maud::{Markup, html};
 use crate::analysis::Analysis;
 use crate::html::words::term;
 use crate::study::{Method, Study, short};
-use crate::svg::{self, Axis, Frame, Line, Point, Series};
+use crate::svg::{self, Axis, Frame, Line, Point, Scale, Series};
 
 /// Fewer values than this make no curve.
 const FEWEST: usize = 3;
@@ -90,7 +90,7 @@ pub fn section(study: &Study, analysis: &Analysis) -> Option<Markup> {
                                 size: (320.0, 210.0),
                                 x: (name, Axis::within(xs(), 5)),
                                 y: ("normalised score", Axis::around(ys(), 4)),
-                                log: false,
+                                scale: Scale::Linear,
                             }, &lines))
                         }
                     }

@@ -185,6 +185,15 @@ pub struct Line {
     pub points: Vec<Point>,
 }
 
+/// What the values of an axis are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// The values themselves.
+    Linear,
+    /// Their decimal logarithms.
+    Log,
+}
+
 /// Size and words of a [`lines`] figure.
 #[derive(Clone, Debug)]
 pub struct Frame<'a> {
@@ -196,8 +205,8 @@ pub struct Frame<'a> {
     pub x: (&'a str, Axis),
     /// Above the vertical axis.
     pub y: (&'a str, Axis),
-    /// Whether values are decimal logarithms.
-    pub log: bool,
+    /// What values of the vertical axis are.
+    pub scale: Scale,
 }
 
 /// Lines with bands. A line of one point is a dot.
@@ -212,7 +221,7 @@ fn marked_lines(frame: &Frame<'_>, lines: &[Line], mark: Option<f64>) -> Markup 
     let ((x_unit, x_axis), (y_unit, y_axis)) = (&frame.x, &frame.y);
     let x = |v: f64| x_axis.place(v, left, right);
     let y = |v: f64| y_axis.place(v.clamp(y_axis.low, y_axis.high), bottom, top);
-    let y_label = |v: f64| if frame.log { power(v) } else { y_axis.label(v) };
+    let y_label = |v: f64| if frame.scale == Scale::Log { power(v) } else { y_axis.label(v) };
     let path = |points: &mut dyn Iterator<Item = (f64, f64)>| -> String {
         points.map(|(a, b)| format!("{},{}", n(x(a)), n(y(b)))).collect::<Vec<_>>().join(" ")
     };

@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig, SingleStageConfig};
 use tce_data::ScoreTable;
-use tce_learn::{DynamicsConfig, FittedQConfig, RowScores};
+use tce_learn::{DynamicsConfig, FittedQConfig, LearnedRows, RowScores};
 
 use crate::error::{Error, Result};
 pub use crate::learners::{Algorithm, LearnerConfig};
@@ -44,6 +44,56 @@ pub struct Config {
     pub learner: LearnerConfig,
     /// How policies are evaluated.
     pub evaluation: EvaluationConfig,
+}
+
+/// A configuration with the names that people write: `single_stage` has its own.
+#[derive(Serialize)]
+struct Named<'a> {
+    target: &'a TargetConfig,
+    source: &'a SourceConfig,
+    generator: &'a GeneratorConfig,
+    filter: &'a FilterConfig,
+    labels: &'a LabelsConfig,
+    dynamics: &'a DynamicsConfig,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fitted_q: Option<&'a FittedQConfig>,
+    single_stage: &'a SingleStageConfig,
+    mixture: &'a MixtureConfig,
+    learner: &'a LearnerConfig,
+    evaluation: &'a EvaluationConfig,
+}
+
+impl<'a> From<&'a Config> for Named<'a> {
+    fn from(config: &'a Config) -> Self {
+        // Every field is named, so that a new one cannot be forgotten.
+        let Config {
+            target,
+            source,
+            generator,
+            filter,
+            labels,
+            dynamics,
+            fitted_q,
+            single_stage,
+            mixture,
+            learner,
+            evaluation,
+        } = config;
+        let fitted_q = (!fitted_q.is_default()).then_some(fitted_q);
+        Self {
+            target,
+            source,
+            generator,
+            filter,
+            labels,
+            dynamics,
+            fitted_q,
+            single_stage,
+            mixture,
+            learner,
+            evaluation,
+        }
+    }
 }
 
 /// How much of the target data is used.
@@ -145,9 +195,12 @@ pub struct MixtureConfig {
 }
 
 impl MixtureConfig {
-    /// Whether rows besides the target's join it.
-    pub fn has_other_rows(&self) -> bool {
-        self.generated != GeneratedRows::None || self.source != SourceRows::None
+    /// Whether rows besides the target's are learned from.
+    pub fn learned_rows(&self) -> LearnedRows {
+        match (self.generated, self.source) {
+            (GeneratedRows::None, SourceRows::None) => LearnedRows::Target,
+            _ => LearnedRows::Mixed,
+        }
     }
 }
 
@@ -245,7 +298,7 @@ impl Config {
 
     /// As TOML, for a run's directory.
     pub fn to_toml(&self) -> String {
-        self.to_keyed_toml().replace("\n[joint", "\n[single_stage")
+        toml::to_string_pretty(&Named::from(self)).expect("a configuration is plain data")
     }
 
     /// As TOML with the names that keys are hashed from: the table `single_stage` is called `joint`, as in earlier versions.

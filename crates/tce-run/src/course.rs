@@ -8,6 +8,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 use tce_augment::config::Length;
 use tce_base::{Step, plan_course, sha256_hex};
+use tce_learn::LearnedRows;
 use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
@@ -92,13 +93,15 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// The training of a policy, by its name in [`learning`].
-    pub fn learning(&mut self, name: &str, config: &Config, mixed: bool) {
+    /// The training of a policy on `rows`, by its name in [`training_step`].
+    pub fn training(&mut self, name: &str, config: &Config, rows: LearnedRows) {
+        // As in the costs of earlier commands.
+        let mixed = rows == LearnedRows::Mixed;
         let learner = &config.learner;
         let mut of = learner.used();
         of["steps"] = Value::Null;
-        let step = self.step(&learning(name), json!([of, mixed, config.evaluation.episodes]));
-        step.size = learner.steps(mixed) as f64;
+        let step = self.step(&training_step(name), json!([of, mixed, config.evaluation.episodes]));
+        step.size = learner.steps(rows) as f64;
         // The other learners train something else before, with bars of its own.
         step.last_bar = (learner.algorithm == Algorithm::Bc).then_some("learn ");
         // The cost depends on the settings, not on the name.
@@ -124,7 +127,7 @@ impl<'a> Course<'a> {
 }
 
 /// What the step is called in which the policy of `name` is trained.
-pub fn learning(name: &str) -> String {
+pub fn training_step(name: &str) -> String {
     format!("learn {name}")
 }
 
@@ -141,7 +144,7 @@ mod tests {
         for variant in [Variant::Bc, Variant::TceOg, Variant::TceNn] {
             let config = Layered::new(Preset::Quick, None, Some(variant), None, &[]).unwrap().config().unwrap();
             course.generating(&config);
-            course.learning(variant.name(), &config, config.mixture.generated != GeneratedRows::None);
+            course.training(variant.name(), &config, config.mixture.learned_rows());
         }
         let steps: Vec<_> = course.steps.iter().map(|s| (s.name.as_str(), s.size)).collect();
         let expected = [

@@ -101,6 +101,15 @@ taken_over! {
     Diffusion: tce_diffusion::DiffusionError;
 }
 
+impl From<tce_base::JsonError> for Error {
+    fn from(error: tce_base::JsonError) -> Self {
+        match error {
+            tce_base::JsonError::File(error) => Self::File(error),
+            tce_base::JsonError::Damaged(text) => Self::Failed(text),
+        }
+    }
+}
+
 impl From<tce_augment::Error> for Error {
     fn from(error: tce_augment::Error) -> Self {
         match error {

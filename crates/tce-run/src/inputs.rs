@@ -15,7 +15,7 @@ use crate::config::{Config, LearnerConfig, TargetConfig, Trajectories};
 use crate::error::{Error, Result};
 use crate::own::{Own, range_of};
 pub use crate::tables::{Behaviour, Table};
-pub use crate::task_data::{DataArgs, d4rl_recipe, ensure_data, source_file, target_file};
+pub use crate::task_data::{Actors, DataArgs, d4rl_recipe, ensure_data, source_file, target_file};
 
 /// Source and target, and what is known about where they come from.
 #[derive(Debug)]

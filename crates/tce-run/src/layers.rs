@@ -328,6 +328,8 @@ impl ConfigArgs {
 
 #[cfg(test)]
 mod tests {
+    use tce_learn::LearnedRows;
+
     use super::*;
     use tce_diffusion::Process;
     use tce_learn::RegulariserKind;
@@ -385,14 +387,17 @@ mod tests {
     #[test]
     fn mixtures_are_cloned_for_fewer_steps() {
         let mut learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;
-        assert_eq!((learner.algorithm, learner.steps(false), learner.steps(true)), (Algorithm::Bc, 50_000, 15_000));
+        assert_eq!(
+            (learner.algorithm, learner.steps(LearnedRows::Target), learner.steps(LearnedRows::Mixed)),
+            (Algorithm::Bc, 50_000, 15_000)
+        );
         learner.steps = 300;
-        assert_eq!(learner.steps(true), 300, "it is no more than was asked for");
+        assert_eq!(learner.steps(LearnedRows::Mixed), 300, "it is no more than was asked for");
         learner.steps = 50_000;
         learner.algorithm = Algorithm::Iql;
-        assert_eq!(learner.steps(true), 50_000, "clones alone");
+        assert_eq!(learner.steps(LearnedRows::Mixed), 50_000, "clones alone");
         let paper = layered(Preset::Paper, None, &["learner.algorithm=bc"]).unwrap().config().unwrap().learner;
-        assert_eq!(paper.steps(true), paper.steps);
+        assert_eq!(paper.steps(LearnedRows::Mixed), paper.steps);
     }
 
     #[test]
@@ -455,6 +460,7 @@ mod tests {
         assert_eq!((old.single_stage.steps, &old), (7, &new));
         assert!(new.to_toml().contains("\n[single_stage.guidance]") && !new.to_toml().contains("joint"));
         let keyed = new.to_keyed_toml();
+        assert_eq!(new.to_toml(), keyed.replace("\n[joint", "\n[single_stage"), "nothing else differs");
         assert!(keyed.contains("\n[joint]\n") && !keyed.contains("single_stage"));
         assert_eq!(toml::from_str::<Config>(&keyed).unwrap(), new);
         assert!(serde_json::to_value(&new).unwrap().get("joint").is_some(), "what keys are hashed from");

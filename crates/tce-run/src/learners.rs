@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 use tce_learn::{
-    About, BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LearnError, MetaDtConfig, Method, Mode,
-    OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    About, BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LearnError, LearnedRows, MetaDtConfig,
+    Method, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -156,14 +156,14 @@ impl LearnerConfig {
         self.own().behaviour(&self.behaviour)
     }
 
-    /// Training steps, by whether there are rows besides the target's.
-    pub fn steps(&self, mixed: bool) -> u64 {
-        self.own().steps(self.steps, mixed)
+    /// Training steps on `rows`.
+    pub fn steps(&self, rows: LearnedRows) -> u64 {
+        self.own().steps(self.steps, rows)
     }
 
-    /// The step from which on only target rows are learned from, where `mixed` batches begin with others.
-    pub fn fade(&self, mixed: bool) -> Option<u64> {
-        self.own().fade(self.steps(mixed)).filter(|_| mixed)
+    /// The step from which on only target rows are learned from; None: other rows are, to the end.
+    pub fn fade(&self, rows: LearnedRows) -> Option<u64> {
+        self.own().fade(self.steps(rows))
     }
 
     /// Rows of each update.

@@ -17,9 +17,9 @@ use crate::augment::{Generated, augment_rows, label_models};
 use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
 use crate::inputs::{Domains, InputSpec, Inputs};
-use crate::learning::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::methods::{negated_costs, row_scores};
 use crate::mixture::{distances, extra_rows};
+use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::stage::Stage;
 
 /// The outcome of a variant.
@@ -194,7 +194,7 @@ pub fn run(
     let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
     drop(extra);
     let place = (attempt.directory(), attempt.key());
-    tce_base::begin_step(&crate::course::learning(name));
+    tce_base::begin_step(&crate::course::training_step(name));
     let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         save_policies(policies, seeds, attempt.directory(), inputs)?;
         files.extend(seeds.iter().map(|&seed| policy_file(seed)));

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use clap::ValueEnum;
 use tce_data::Task;
+use tce_learn::LearnedRows;
 use tce_report::{Budget, Change, Recipe, RunFolder};
 
 use crate::config::Config;
@@ -23,7 +24,7 @@ struct Known {
 #[derive(Default)]
 pub struct Recipes {
     presets: BTreeMap<(String, String), Vec<Known>>,
-    found: BTreeMap<(String, String, String, bool), Arc<Recipe>>,
+    found: BTreeMap<(String, String, String, LearnedRows), Arc<Recipe>>,
 }
 
 /// Every setting by its full name.
@@ -59,8 +60,8 @@ fn settings(text: &str) -> BTreeMap<String, String> {
     out
 }
 
-fn budget(config: &Config, mixed: bool) -> Budget {
-    Budget { learner: config.learner.algorithm.about().name.to_owned(), updates: config.learner.steps(mixed) }
+fn budget(config: &Config, rows: LearnedRows) -> Budget {
+    Budget { learner: config.learner.algorithm.about().name.to_owned(), updates: config.learner.steps(rows) }
 }
 
 fn presets(task: Task, variant: Variant) -> Vec<Known> {
@@ -91,12 +92,12 @@ fn changes(own: &BTreeMap<String, String>, preset: &BTreeMap<String, String>) ->
 impl Recipes {
     /// The recipe of a run of `variant`, as its folder is called.
     pub fn of(&mut self, task: Task, variant: &str, folder: &RunFolder) -> Arc<Recipe> {
-        let mixed = folder.extra_rows > 0;
-        let key = (task.to_string(), variant.to_owned(), folder.config_hash.clone(), mixed);
+        let rows = if folder.extra_rows > 0 { LearnedRows::Mixed } else { LearnedRows::Target };
+        let key = (task.to_string(), variant.to_owned(), folder.config_hash.clone(), rows);
         if let Some(recipe) = self.found.get(&key) {
             return recipe.clone();
         }
-        let learner = toml::from_str::<Config>(&folder.config).ok().map(|c| budget(&c, mixed));
+        let learner = toml::from_str::<Config>(&folder.config).ok().map(|c| budget(&c, rows));
         let mut recipe = Recipe { learner, ..Recipe::default() };
         if let Ok(variant) = Variant::from_str(variant, false) {
             let place = (key.0.clone(), key.1.clone());
@@ -106,7 +107,7 @@ impl Recipes {
             if let Some((preset, changed)) = nearest.min_by_key(|(_, changed)| changed.len()) {
                 (recipe.preset, recipe.changed) = (Some(preset.name.clone()), changed);
             }
-            recipe.paper = known.iter().find(|k| k.name == "paper").map(|k| budget(&k.config, mixed));
+            recipe.paper = known.iter().find(|k| k.name == "paper").map(|k| budget(&k.config, rows));
         }
         let recipe = Arc::new(recipe);
         self.found.insert(key, recipe.clone());

@@ -18,7 +18,9 @@ use std::time::SystemTime;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use tce_base::metrics::Metrics;
-use tce_base::{FileError, Owner, PROGRAM, link_first, read_if_there, sha256_file, sha256_hex, write_json};
+use tce_base::{
+    Damage, FileError, Owner, PROGRAM, link_first, read_json, sha256_files, sha256_hex, verify_sha256, write_json,
+};
 use tce_nn::{Checkpoints, Device};
 
 use crate::device_kind::DeviceKind;
@@ -84,11 +86,7 @@ impl Stage {
     }
 
     fn done<T: DeserializeOwned>(&self) -> Result<Option<Done<T>>> {
-        let path = self.file("done.json");
-        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
-        serde_json::from_slice(&bytes)
-            .map(Some)
-            .map_err(|e| Error::Failed(format!("{}: {e}; remove the directory to do the stage again", path.display())))
+        Ok(read_json(&self.file("done.json"), "remove the directory to do the stage again")?)
     }
 
     /// The summary, if the stage is done and its files are what they were.
@@ -104,16 +102,13 @@ impl Stage {
             self.clear(&done.attempt);
         }
         for (name, expected) in &done.files {
-            let file = self.file(name);
-            let found = sha256_file(&file)?;
-            if found != *expected {
-                return Err(Error::Failed(format!(
-                    "{}: SHA-256 {found}, expected {expected}: the file was changed since the stage was done; remove {} to \
-                     do it again",
-                    file.display(),
+            verify_sha256(&self.file(name), expected).map_err(|damage| match damage {
+                Damage::File(error) => error.into(),
+                changed => Error::Failed(format!(
+                    "{changed}: the file was changed since the stage was done; remove {} to do it again",
                     self.directory.display()
-                )));
-            }
+                )),
+            })?;
         }
         Ok(Some(done.summary))
     }
@@ -230,12 +225,11 @@ impl Attempt {
     /// # Errors
     /// If another attempt was first with other bytes; if a file cannot be read or written.
     pub fn finish<T: Serialize>(self, files: &[String], summary: T) -> Result<()> {
-        let hashes = files.iter().map(|f| Ok((f.clone(), sha256_file(&self.file(f))?))).collect::<Result<_>>()?;
         let done = Done {
             program: PROGRAM.into(),
             machine: tce_nn::machine(),
             attempt: self.name.clone(),
-            files: hashes,
+            files: sha256_files(&self.directory, files.iter().cloned())?,
             summary,
         };
         let own = self.file("done.json");

@@ -140,7 +140,7 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
                     Some(folder) => {
                         agree(sweep, entry, outcome.score, &folder)?;
                         study.costs.push(Cost {
-                            stage: learning(&method_title(&study.methods, &entry.column())),
+                            stage: training_stage(&method_title(&study.methods, &entry.column())),
                             agent: entry.task.agent,
                             seconds: folder.learning_seconds,
                             seeds: folder.members.len(),
@@ -178,7 +178,8 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     Ok(study)
 }
 
-fn learning(title: &str) -> String {
+/// The kind of work in costs; records have it, so that it does not change.
+fn training_stage(title: &str) -> String {
     format!("Learning and evaluation, {title}")
 }
 
@@ -302,7 +303,7 @@ fn of_runs(directory: &Path) -> Result<Study> {
     let mut recipes = Recipes::default();
     for ((of, name, folder), id) in finished.into_iter().zip(ids) {
         study.costs.push(Cost {
-            stage: learning(&method_title(&study.methods, &id)),
+            stage: training_stage(&method_title(&study.methods, &id)),
             agent: of.agent,
             seconds: folder.learning_seconds,
             seeds: folder.members.len(),

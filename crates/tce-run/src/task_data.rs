@@ -31,6 +31,22 @@ pub struct DataArgs {
     pub out: PathBuf,
 }
 
+/// Whose actors collect rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Actors {
+    /// The zoo's.
+    Zoo,
+    /// The zoo's, and those of the shared folder for what the zoo lacks.
+    ZooOrShared,
+}
+
+impl DataArgs {
+    /// Whose actors may be used.
+    pub fn actors(&self) -> Actors {
+        if self.from_zoo { Actors::Zoo } else { Actors::ZooOrShared }
+    }
+}
+
 /// Where the data of a task come from.
 enum Origin {
     /// A file that is there.
@@ -101,7 +117,7 @@ fn target_origin(task: Task, args: &DataArgs) -> Result<Origin> {
 fn source_origin(task: Task, args: &DataArgs, rows: usize) -> Result<Origin> {
     match &args.source {
         Some(path) => Ok(Origin::File(path.clone())),
-        None => Ok(Origin::Collected(d4rl_recipe(task.agent, task.source, rows, 0, args.from_zoo)?)),
+        None => Ok(Origin::Collected(d4rl_recipe(task.agent, task.source, rows, 0, args.actors())?)),
     }
 }
 
@@ -157,14 +173,17 @@ fn data_name(agent: Agent, shift: Shift, quality: Quality) -> String {
 }
 
 /// Source data of this quality at D4RL's specification: from the zoo, or from the stand-ins of the shared folder for what the zoo
-/// lacks, unless `from_zoo`.
+/// lacks, if `actors` may be of both.
 ///
 /// # Errors
 /// If an actor is missing in both.
-pub fn d4rl_recipe(agent: Agent, quality: Quality, rows: usize, seed: u64, from_zoo: bool) -> Result<Recipe> {
+pub fn d4rl_recipe(agent: Agent, quality: Quality, rows: usize, seed: u64, actors: Actors) -> Result<Recipe> {
     let of = |cast: Cast| cast.source(agent, Shift::Source, quality, rows, seed);
     let recipe = of(exhibits::cast(agent, Shift::Source)?);
-    let recipe = recipe.or_else(|| if from_zoo { None } else { of(stand_ins::cast(agent, &shared_folder())) });
+    let recipe = recipe.or_else(|| match actors {
+        Actors::Zoo => None,
+        Actors::ZooOrShared => of(stand_ins::cast(agent, &shared_folder())),
+    });
     recipe.ok_or_else(|| missing(Shift::Source, quality, agent, "--source"))
 }
 

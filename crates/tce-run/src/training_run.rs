@@ -16,19 +16,19 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tce_base::{read_if_there, sha256_hex};
 use tce_data::ScoreTable;
-use tce_learn::OtherRows;
+use tce_learn::{LearnedRows, OtherRows};
 use tce_nn::Device;
 use tce_zoo::actors::Arena;
 
 use crate::config::{Algorithm, Config, LearnerConfig};
-use crate::course::{Course, learning};
+use crate::course::{Course, training_step};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, Table};
-use crate::learning::{Learned, MemberData, learn, save_policies};
 use crate::methods::row_scores;
 use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
+use crate::policy_training::{Learned, MemberData, learn, save_policies};
 use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
 /// The name of the baseline: clones of the target rows alone.
@@ -73,11 +73,11 @@ pub struct Trained {
     pub verdict: Option<Kept>,
 }
 
-/// Refuses options that `learner` has no use for, and a training without the `extra` rows that it needs.
+/// Refuses options that `learner` has no use for, and a training without other `rows` that it needs.
 ///
 /// # Errors
 /// Names the option.
-pub fn ensure_fits(learner: &LearnerConfig, extra: bool) -> Result<()> {
+pub fn ensure_fits(learner: &LearnerConfig, rows: LearnedRows) -> Result<()> {
     let method = learner.algorithm.about();
     if learner.top < 1.0 && learner.algorithm != Algorithm::Bc {
         return Err(Error::Usage(format!(
@@ -85,7 +85,7 @@ pub fn ensure_fits(learner: &LearnerConfig, extra: bool) -> Result<()> {
             learner.top, method.name
         )));
     }
-    if !extra && method.needs == OtherRows::Source {
+    if rows == LearnedRows::Target && method.needs == OtherRows::Source {
         return Err(Error::Usage(format!(
             "learner {}: found target rows alone, expected source rows as well; give them with --extra FILE (Python: extra=)",
             method.name
@@ -100,7 +100,7 @@ impl TrainingRun<'_> {
     /// # Errors
     /// If the learner needs other rows than there are, the directory holds another run, training fails, or the user interrupts.
     pub fn run(&self, inputs: &Inputs, device: &Device) -> Result<Trained> {
-        ensure_fits(&self.config.learner, inputs.extra.is_some())?;
+        ensure_fits(&self.config.learner, LearnedRows::with(inputs.extra.as_ref()))?;
         inputs.ensure_episodes(&self.config.learner)?;
         let (out, seeds) = (self.out, self.seeds);
         let method = self.config.learner.algorithm.about();
@@ -115,7 +115,7 @@ impl TrainingRun<'_> {
         tce_base::write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
-        tce_base::begin_step(&learning(method.name));
+        tce_base::begin_step(&training_step(method.name));
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
         let mut policies = Vec::new();
         let (learner, evaluation) = (&self.config.learner, &self.config.evaluation);
@@ -169,7 +169,7 @@ impl TrainingRun<'_> {
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
         let directory = self.out.join("baseline");
-        tce_base::begin_step(&learning(BASELINE));
+        tce_base::begin_step(&training_step(BASELINE));
         let mut files = Vec::new();
         learn(data, &learner, &self.config.evaluation, None, (&directory, key), device, |policies| {
             files = save_policies(policies, self.seeds, &directory, inputs)?;
@@ -207,14 +207,16 @@ impl TrainingRun<'_> {
     fn plan(&self, inputs: &Inputs, device: &Device) {
         let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
-        let mixed = inputs.extra.is_some();
-        course.learning(config.learner.algorithm.about().name, config, mixed);
+        let learned = LearnedRows::with(inputs.extra.as_ref());
+        course.training(config.learner.algorithm.about().name, config, learned);
         if self.comparison == Comparison::Recommend {
-            if mixed {
-                course.learning(BASELINE, &Config { learner: self.baseline_learner(), ..config.clone() }, false);
+            if learned == LearnedRows::Mixed {
+                let baseline = Config { learner: self.baseline_learner(), ..config.clone() };
+                course.training(BASELINE, &baseline, LearnedRows::Target);
             }
             course.verdict(config);
-            course.fitted_q(config, seeds * if mixed { 2 } else { 1 });
+            let policies = if learned == LearnedRows::Mixed { 2 } else { 1 };
+            course.fitted_q(config, seeds * policies);
         }
         course.plan();
     }

@@ -319,7 +319,7 @@ pub fn evaluate<A: Actor>(
     streams: Streams,
     stop: impl Fn() -> bool,
 ) -> Result<Vec<EpisodeResult>, SimError> {
-    let lanes = evaluate_lanes(agent, shift, actor, episodes, streams, false, stop)?;
+    let lanes = evaluate_lanes(agent, shift, actor, episodes, streams, Record::Nothing, stop)?;
     Ok(lanes.into_iter().map(|lane| lane.result).collect())
 }
 
@@ -335,10 +335,17 @@ pub fn evaluate_recorded<A: Actor>(
     streams: Streams,
     stop: impl Fn() -> bool,
 ) -> Result<(Vec<EpisodeResult>, Recording), SimError> {
-    let mut lanes = evaluate_lanes(agent, shift, actor, episodes, streams, true, stop)?;
+    let mut lanes = evaluate_lanes(agent, shift, actor, episodes, streams, Record::First, stop)?;
     let recording = lanes.first_mut().and_then(|lane| lane.recording.take());
     let recording = recording.ok_or(SimError::Option { option: "episodes", found: 0, expected: "at least 1" })?;
     Ok((lanes.into_iter().map(|lane| lane.result).collect(), recording))
+}
+
+/// Of which episodes there are recordings.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Record {
+    Nothing,
+    First,
 }
 
 fn evaluate_lanes<A: Actor>(
@@ -347,13 +354,13 @@ fn evaluate_lanes<A: Actor>(
     actor: &A,
     episodes: usize,
     streams: Streams,
-    record: bool,
+    record: Record,
     stop: impl Fn() -> bool,
 ) -> Result<Vec<Evaluator>, SimError> {
     let model = compiled(agent, shift)?;
     let starts = (0..episodes).map(|index| {
         let result = EpisodeResult { episode_return: 0.0, length: 0, unstable: false };
-        let recording = (record && index == 0).then(|| Recording::new(agent, shift));
+        let recording = (record == Record::First && index == 0).then(|| Recording::new(agent, shift));
         let i = index as u64;
         let lane = Evaluator { index, result, recording };
         (lane, streams.indexed("evaluate/reset", i), streams.indexed("evaluate/action", i))

@@ -26,5 +26,14 @@ pub enum Error {
     Failed(String),
 }
 
+impl From<tce_base::JsonError> for Error {
+    fn from(error: tce_base::JsonError) -> Self {
+        match error {
+            tce_base::JsonError::File(error) => Self::File(error),
+            tce_base::JsonError::Damaged(text) => Self::Failed(text),
+        }
+    }
+}
+
 /// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;

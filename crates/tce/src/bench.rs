@@ -89,8 +89,8 @@ const OWN: &[Own] = &[
     ("iql-kl", "IQL with the forward-KL term of Eq. 10", |on| iql(on, on.seeds, RegulariserKind::ForwardKl)),
     ("sac", "SAC, 17/6, 256-256, 256 rows", sac),
     ("bc", "behaviour cloning, 256 rows", bc),
-    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", |on| meta_dt(on, false)),
-    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", |on| meta_dt(on, true)),
+    ("meta-dt", "Meta-DT's transformer, 128 segments of 8 steps", meta_dt),
+    ("meta-dt-world", "its world model, 128 rows with 8 steps of history", meta_dt_world),
     ("score-train", "training of a score network (Table B.1), 128 rows", score_train),
     ("score-eval-1k", "evaluation of a score network as in sampling, 1 024 rows", |on| score_eval(on, 1024)),
     ("score-eval-4k", "the same, 4 096 rows", |on| score_eval(on, 4096)),
@@ -236,7 +236,7 @@ fn members(seeds: u64) -> Vec<Member> {
 }
 
 /// Ten steps a call of learners side by side, as [`tce_run::learning`] trains them.
-fn learning<L: Learner + ?Sized + 'static>(device: &Device, jobs: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
+fn training<L: Learner + ?Sized + 'static>(device: &Device, jobs: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
     let (device, seeds) = (device.clone(), jobs.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
     let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = jobs.into_iter().unzip();
     let mut from = 0;
@@ -290,7 +290,7 @@ fn iql(on: &On, seeds: u64, kind: RegulariserKind) -> Body {
     );
     // V(s) and V(s'), the gradient of V; twins: target, online, gradient; policy and gradient. No gradient of an input.
     let products = 2.0 * v + (2.0 * v - v1) + 2.0 * (2.0 * q + 2.0 * q - q1) + (3.0 * pi - pi1);
-    learning(device, jobs(on, seeds, job), 2.0 * BATCH as f64 * products)
+    training(device, jobs(on, seeds, job), 2.0 * BATCH as f64 * products)
 }
 
 fn sac(On { device, .. }: &On) -> Body {
@@ -300,7 +300,7 @@ fn sac(On { device, .. }: &On) -> Body {
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, 2 * ACT]);
     // Policy at s' and s, with its gradient; critics: target, online, gradient, and to the action and back.
     let products = (4.0 * pi - pi1) + 2.0 * (q + 3.0 * q - q1 + 2.0 * q);
-    learning(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * products)
+    training(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * products)
 }
 
 /// A method as the default preset has it, with target and source rows; what it trains before its first step is not timed.
@@ -317,41 +317,42 @@ fn method(on: &On, algorithm: Algorithm) -> Body {
         let learner = build(&buffer, &config, Place::NONE, &on.device).expect("defaults");
         (buffer, learner)
     };
-    learning(&on.device, jobs(on, on.seeds, job), 0.0)
+    training(&on.device, jobs(on, on.seeds, job), 0.0)
 }
 
 fn bc(On { device, .. }: &On) -> Body {
     let buffer = Buffer::new(members(1), BATCH).expect("good data");
     let learner = Bc::new(&buffer, &BcConfig::default(), 1 << 40, device).expect("defaults");
     let (pi, pi1) = row_products(&[OBS, WIDTH, WIDTH, ACT]);
-    learning(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
+    training(device, vec![(buffer, Box::new(learner))], 2.0 * BATCH as f64 * (3.0 * pi - pi1))
 }
 
-/// The transformer's updates, or those of its `world` model.
-fn meta_dt(On { device, .. }: &On, world: bool) -> Body {
+/// Meta-DT's configuration, and few rows: their contexts, which a training computes once, are all there after the warm-up.
+fn meta_dt_rows() -> (MetaDtConfig, Buffer) {
     let mut c = MetaDtConfig::default();
     c.world_model.steps = 0;
-    // Few rows: their contexts, which a training computes once, are all there after the warm-up.
-    let buffer = Buffer::new(members(1), BATCH).expect("good data").target_only(BATCH).expect("target rows");
-    let learner: Box<dyn Learner> = match world {
-        true => Box::new(Worlds::new(&buffer, &c.world_model, device)),
-        false => Box::new(MetaDt::new(&buffer, &c, Place::NONE, device).expect("defaults").expect("not interrupted")),
-    };
+    (c, Buffer::new(members(1), BATCH).expect("good data").target_only(BATCH).expect("target rows"))
+}
+
+fn meta_dt(On { device, .. }: &On) -> Body {
+    let (c, buffer) = meta_dt_rows();
+    let learner = MetaDt::new(&buffer, &c, Place::NONE, device).expect("defaults").expect("not interrupted");
     let (w, square) = (&c.world_model, (c.embed * c.embed) as f64);
-    let products = if world {
-        let step = (OBS + ACT + 1) * w.features + 3 * w.gru * (3 * w.features + w.gru);
-        let decoder = |out: usize| row_products(&[OBS + ACT + w.latent, w.hidden[0], w.hidden[1], out]).0;
-        (w.horizon * step + w.gru * w.latent) as f64 + decoder(OBS) + decoder(1)
-    } else {
-        let (all, states) = ((3 * c.context - 1) as f64, c.context as f64);
-        // Query, key, value and output take 4 products of a token with a square, the two layers behind them 8; the last block
-        // computes keys and values alone for the tokens that are no states.
-        let blocks = (c.layers - 1) as f64 * (12.0 * all * square + 2.0 * all * all * c.embed as f64);
-        let last = (2.0 * all + 10.0 * states) * square + 2.0 * all * states * c.embed as f64;
-        let step = OBS * w.features + (1 + w.features + w.latent + 2 * ACT) * c.embed;
-        blocks + last + states * step as f64
-    };
-    learning(device, vec![(buffer, learner)], 2.0 * c.batch as f64 * 3.0 * products)
+    let (all, states) = ((3 * c.context - 1) as f64, c.context as f64);
+    // Query, key, value and output take 4 products of a token with a square, two layers 8; of other tokens than states the last has 2.
+    let blocks = (c.layers - 1) as f64 * (12.0 * all * square + 2.0 * all * all * c.embed as f64);
+    let last = (2.0 * all + 10.0 * states) * square + 2.0 * all * states * c.embed as f64;
+    let step = OBS * w.features + (1 + w.features + w.latent + 2 * ACT) * c.embed;
+    training(device, vec![(buffer, Box::new(learner))], 6.0 * c.batch as f64 * (blocks + last + states * step as f64))
+}
+
+fn meta_dt_world(On { device, .. }: &On) -> Body {
+    let (c, buffer) = meta_dt_rows();
+    let (w, learner) = (&c.world_model, Worlds::new(&buffer, &c.world_model, device));
+    let step = (OBS + ACT + 1) * w.features + 3 * w.gru * (3 * w.features + w.gru);
+    let decoder = |out: usize| row_products(&[OBS + ACT + w.latent, w.hidden[0], w.hidden[1], out]).0;
+    let products = (w.horizon * step + w.gru * w.latent) as f64 + decoder(OBS) + decoder(1);
+    training(device, vec![(buffer, Box::new(learner))], 6.0 * c.batch as f64 * products)
 }
 
 fn cvae(On { device, .. }: &On) -> Body {
@@ -362,7 +363,7 @@ fn cvae(On { device, .. }: &On) -> Body {
     let (encoder, first) = row_products(&[OBS + ACT, WIDTH, WIDTH, 2 * latent]);
     let (decoder, _) = row_products(&[OBS + latent, WIDTH, WIDTH, ACT]);
     let flops = 2.0 * config.batch as f64 * (3.0 * (encoder + decoder) - first);
-    learning(device, vec![(buffer, Box::new(learner))], flops)
+    training(device, vec![(buffer, Box::new(learner))], flops)
 }
 
 fn labels(On { device, .. }: &On) -> Body {
@@ -377,7 +378,7 @@ fn labels(On { device, .. }: &On) -> Body {
         let (all, first) = row_products(&widths);
         3.0 * all - first
     };
-    learning(device, vec![(buffer, Box::new(models))], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
+    training(device, vec![(buffer, Box::new(models))], 2.0 * config.batch as f64 * (model(ACT) + model(1)))
 }
 
 /// Multiply-adds per row of a score network: all of it, and what is left of it when time and condition are put in.

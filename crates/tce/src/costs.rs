@@ -67,7 +67,7 @@ impl Rates {
     /// The learner's updates.
     pub fn training(&mut self, config: &Config) -> Result<f64> {
         let learner = &config.learner;
-        let steps = learner.steps(config.mixture.has_other_rows()) as f64;
+        let steps = learner.steps(config.mixture.learned_rows()) as f64;
         Ok(match learner.algorithm {
             // The workload is one clone of two layers.
             Algorithm::Bc => {

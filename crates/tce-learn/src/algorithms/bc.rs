@@ -40,7 +40,7 @@ use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 use crate::actor::{Actor, ActorConfig, PolicyForm};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
-use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
+use crate::method::{About, Built, LearnedRows, Method, OtherRows, RowScores, Setup};
 use crate::networks::Dropout;
 use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Learner, Meter};
@@ -87,9 +87,9 @@ impl Method for BcConfig {
         (self.fade > 0.0).then(|| (self.fade * steps as f64).round() as u64)
     }
 
-    fn steps(&self, steps: u64, mixed: bool) -> u64 {
+    fn steps(&self, steps: u64, rows: LearnedRows) -> u64 {
         match self.mixed_steps {
-            most if mixed && most > 0 => steps.min(most),
+            most if rows == LearnedRows::Mixed && most > 0 => steps.min(most),
             _ => steps,
         }
     }

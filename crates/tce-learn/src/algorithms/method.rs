@@ -56,6 +56,22 @@ pub enum RowScores {
     Density,
 }
 
+/// Which rows a policy is learned from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum LearnedRows {
+    /// The target's alone.
+    Target,
+    /// The target's, and others: source or generated rows.
+    Mixed,
+}
+
+impl LearnedRows {
+    /// The target's, and `others` if there are any.
+    pub fn with<T>(others: Option<&T>) -> Self {
+        if others.is_some() { Self::Mixed } else { Self::Target }
+    }
+}
+
 /// Requirements on the rows other than the target's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OtherRows {
@@ -147,9 +163,9 @@ pub trait Method {
         base.clone()
     }
 
-    /// Number of training steps, given the requested `steps` and whether there are rows other than the target's.
-    fn steps(&self, steps: u64, mixed: bool) -> u64 {
-        let _ = mixed;
+    /// Number of training steps on `rows`, where `steps` were asked for.
+    fn steps(&self, steps: u64, rows: LearnedRows) -> u64 {
+        let _ = rows;
         steps
     }
 

@@ -98,7 +98,7 @@ pub fn prepare<L: Learner>(
     let mut jobs = [TrainingJob { learner, buffer }];
     let steps = Steps::new(steps, (steps / PREPARATION_REPORTS).max(1));
     let training = label.replace(' ', "-").to_lowercase();
-    let outcome = advance(&mut jobs, steps, label, &mut checkpoints, true, device, |_, report, _| {
+    let outcome = advance(&mut jobs, steps, label, &mut checkpoints, AtTheEnd::Keep, device, |_, report, _| {
         if let Some(journal) = place.journal {
             let mut reports = journal.0.lock().expect("no job has panicked");
             reports.push((place.job, training.clone(), report.clone()));
@@ -309,17 +309,26 @@ pub fn train_side_by_side<L: Learner + ?Sized, E: From<LearnError>>(
     device: &Device,
     on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
-    advance(jobs, steps, label, checkpoints, false, device, on_report)
+    advance(jobs, steps, label, checkpoints, AtTheEnd::Leave, device, on_report)
 }
 
-/// The loop. `keep_end`: also store the end as a checkpoint, for a preparation. Its reports are stored in the
-/// checkpoints and all given at the end, including those of an earlier process and of a run with no steps left.
+/// What the loop does with its state after the last step.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum AtTheEnd {
+    /// The caller has the result.
+    Leave,
+    /// It is stored as a checkpoint, too, for a preparation. Reports are stored in the checkpoints and all given at the
+    /// end, including those of an earlier process and of a run with no steps left.
+    Keep,
+}
+
+/// The loop.
 fn advance<L: Learner + ?Sized, E: From<LearnError>>(
     jobs: &mut [TrainingJob<L>],
     steps: Steps,
     label: &str,
     checkpoints: &mut Checkpoints,
-    keep_end: bool,
+    at_the_end: AtTheEnd,
     device: &Device,
     mut on_report: impl FnMut(usize, &Report, &L) -> Result<(), E>,
 ) -> Result<Outcome, E> {
@@ -361,15 +370,15 @@ fn advance<L: Learner + ?Sized, E: From<LearnError>>(
                         k + member
                     );
                 }
-                match keep_end {
-                    true => run.history.push(metrics),
-                    false => on_report(k, &report, run.job.learner)?,
+                match at_the_end {
+                    AtTheEnd::Keep => run.history.push(metrics),
+                    AtTheEnd::Leave => on_report(k, &report, run.job.learner)?,
                 }
             }
         }
     }
     progress.finish();
-    if keep_end {
+    if at_the_end == AtTheEnd::Keep {
         if begun < steps.to {
             checkpoints.keep(steps.to, state_of(&runs)).map_err(LearnError::from)?;
         }

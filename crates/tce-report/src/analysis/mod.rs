@@ -18,7 +18,7 @@ mod recommended;
 mod warnings;
 
 pub use analyse::analyse;
-pub use effects::{Effect, Gap, LEAST, SURE};
+pub use effects::Gap;
 pub use opening::{gap_words, opening, verdict_words};
 pub use recipes::{Recipes, thousands};
 pub use recommended::Recommendation;

@@ -8,7 +8,7 @@ use tce_diagnosis::{
 
 use super::numbers::number;
 use crate::html::parts::decades;
-use crate::svg::{self, Axis, Cloud, Frame, Line, Point, Series, Steps};
+use crate::svg::{self, Axis, Cloud, Frame, Line, Point, Scale, Series, Steps};
 
 const SIZE: (f64, f64) = (320.0, 220.0);
 
@@ -26,18 +26,18 @@ fn bare(x: f64, y: f64) -> Option<Point> {
 }
 
 /// A figure with its key.
-fn figure(title: &str, note: &str, x: (&str, Axis), y_unit: &str, log: bool, lines: Vec<Option<Line>>) -> Markup {
+fn figure(title: &str, note: &str, x: (&str, Axis), y_unit: &str, scale: Scale, lines: Vec<Option<Line>>) -> Markup {
     let lines: Vec<Line> = lines.into_iter().flatten().collect();
     if lines.is_empty() {
         return html! {};
     }
     let heights = || lines.iter().flat_map(|l| &l.points).flat_map(|p| [p.y, p.range().0, p.range().1]);
-    let y = if log { decades(heights()) } else { Axis::around(heights().chain([0.0]), 4) };
+    let y = if scale == Scale::Log { decades(heights()) } else { Axis::around(heights().chain([0.0]), 4) };
     html! {
         figure {
             figcaption { (title) @if !note.is_empty() { " " span { (note) } } }
             div class="keys" { @for l in &lines { (svg::key(&l.series)) } }
-            (svg::lines(&Frame { label: title, size: SIZE, x, y: (y_unit, y), log }, &lines))
+            (svg::lines(&Frame { label: title, size: SIZE, x, y: (y_unit, y), scale }, &lines))
         }
     }
 }
@@ -60,7 +60,7 @@ pub(super) fn coverage(d: &Diagnosis) -> Markup {
         "share of real states that are reached",
         ("y_max", y_axis(d)),
         "share",
-        false,
+        Scale::Linear,
         vec![
             line("target states, by generated rows", "m0", over(&|b| b.coverage.map(|c| c.target)).into_iter()),
             line(
@@ -83,7 +83,7 @@ pub(super) fn copies(d: &Diagnosis) -> Markup {
         "how often a row that passes the filter is nearer to a training row than a held-out row is",
         ("y_max", y_axis(d)),
         "share of comparisons",
-        false,
+        Scale::Linear,
         vec![
             line("generated rows", "m0", over(&|m| m.probability).into_iter()),
             line("if all were copies", "m1", over(&|m| m.of_copies).into_iter()),
@@ -95,27 +95,28 @@ pub(super) fn copies(d: &Diagnosis) -> Markup {
 pub(super) fn reliability(d: &Diagnosis) -> Markup {
     let few = format!("a model of {} target rows against one of many simulated rows", d.target_rows);
     type Get = fn(&Reliability) -> Option<Spread>;
-    let panels: [(&str, &str, &str, bool, Get); 5] = [
-        ("Distance of ŝ", "to the nearest real state", "standard deviations", false, |r| r.distance),
-        ("Transition KL", &few, "nats per dimension (logarithmic)", true, |r| r.transition_kl),
-        ("Reward difference", &few, "|ΔR| (logarithmic)", true, |r| r.reward_difference),
-        ("Reward error", "against the simulator at (ŝ, â)", "|r̂ − r| (logarithmic)", true, |r| r.reward_error),
-        ("Dynamics consistency", "ŝ' against the simulator", "steps (logarithmic)", true, |r| r.consistency),
+    let panels: [(&str, &str, &str, Scale, Get); 5] = [
+        ("Distance of ŝ", "to the nearest real state", "standard deviations", Scale::Linear, |r| r.distance),
+        ("Transition KL", &few, "nats per dimension (logarithmic)", Scale::Log, |r| r.transition_kl),
+        ("Reward difference", &few, "|ΔR| (logarithmic)", Scale::Log, |r| r.reward_difference),
+        ("Reward error", "against the simulator at (ŝ, â)", "|r̂ − r| (logarithmic)", Scale::Log, |r| {
+            r.reward_error
+        }),
+        ("Dynamics consistency", "ŝ' against the simulator", "steps (logarithmic)", Scale::Log, |r| r.consistency),
     ];
-    let points = |get: Get, log: bool, outliers: bool| {
+    let points = |of: fn(&AtBound) -> Option<&Reliability>, get: Get, scale: Scale| {
         let point = |b: &AtBound| {
-            let of = if outliers { b.outliers.as_ref() } else { Some(&b.kept) };
-            let s = get(of?)?;
-            let map = |v: f64| if log { v.max(1e-9).log10() } else { v };
+            let s = get(of(b)?)?;
+            let map = |v: f64| if scale == Scale::Log { v.max(1e-9).log10() } else { v };
             Some(Point { x: b.y_max, y: map(s.median), band: Some((map(s.p10), map(s.p90))) })
         };
         d.bounds_of_y.iter().map(point).collect::<Vec<_>>()
     };
     html! {
-        @for (title, note, unit, log, get) in panels {
-            (figure(title, note, ("y_max", y_axis(d)), unit, log, vec![
-                line("kept", "m0", points(get, log, false).into_iter()),
-                line("rejected by the filter", "m1", points(get, log, true).into_iter()),
+        @for (title, note, unit, scale, get) in panels {
+            (figure(title, note, ("y_max", y_axis(d)), unit, scale, vec![
+                line("kept", "m0", points(|b| Some(&b.kept), get, scale).into_iter()),
+                line("rejected by the filter", "m1", points(|b| b.outliers.as_ref(), get, scale).into_iter()),
             ]))
         }
     }
@@ -143,7 +144,7 @@ pub(super) fn distance(e: &ErrorOverDistance) -> Markup {
         &note,
         ("distance of ŝ to the target's states", Axis::around(e.bins.iter().map(|b| b.distance).chain([0.0]), 5)),
         "error in steps (logarithmic)",
-        true,
+        Scale::Log,
         vec![line(series, "m0", points)],
     )
 }
@@ -183,7 +184,7 @@ pub(super) fn histograms(d: &Diagnosis) -> Markup {
             size: SIZE,
             x: (unit, x),
             y: ("share of rows", Axis::around(counts().chain([0.0]), 4)),
-            log: false,
+            scale: Scale::Linear,
         };
         html! {
             figure {
@@ -225,7 +226,7 @@ pub(super) fn theorem(b: &Bounds) -> Markup {
             &format!("(the bound is {} times this)", number(factor)),
             ("λ", lambdas()),
             unit,
-            false,
+            Scale::Linear,
             vec![
                 curve("nearest source rows, by the simulator", "m0", truth, |c| &c.nearest),
                 curve("all source rows, by the simulator", "m1", truth, |c| &c.all),

@@ -8,7 +8,7 @@ use tce_data::Task;
 use super::{classes, decades, term};
 use crate::analysis::Analysis;
 use crate::study::{Study, shift_title, short};
-use crate::svg::{self, Axis, Frame, Line, Point, Series};
+use crate::svg::{self, Axis, Frame, Line, Point, Scale, Series};
 
 /// Points of a curve; more would be finer than the pixels.
 const CURVE_POINTS: usize = 60;
@@ -56,14 +56,15 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
     let everything = lines("learn/policy_loss", &|v| v);
     let positive = everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.range().0 > 0.0);
     let losses = if positive { lines("learn/policy_loss", &f64::log10) } else { everything };
+    let scale = if positive { Scale::Log } else { Scale::Linear };
     let several = tasks.iter().map(|t| t.shift).collect::<BTreeSet<_>>().len() > 1;
-    let panels = |figures: &[(Task, Vec<Line>)], y_unit: &str, log: bool| {
+    let panels = |figures: &[(Task, Vec<Line>)], y_unit: &str, scale: Scale| {
         html! {
             div class="panels small" {
                 @for (task, lines) in figures {
                     @let points = || lines.iter().flat_map(|l| &l.points);
                     @let heights = points().flat_map(|p| [p.y, p.range().0, p.range().1]);
-                    @let y = if log { decades(heights) } else { Axis::around(heights, 4) };
+                    @let y = if scale == Scale::Log { decades(heights) } else { Axis::around(heights, 4) };
                     figure {
                         figcaption {
                             (short(task))
@@ -74,7 +75,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
                             size: (320.0, 210.0),
                             x: ("update steps", Axis::within(points().map(|p| p.x).chain([0.0]), 5)),
                             y: (y_unit, y),
-                            log,
+                            scale,
                         }, lines))
                     }
                 }
@@ -90,7 +91,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
         @if on_the_way {
             h3 { "Score during training" }
             (keys(&scores))
-            (panels(&scores, "normalised score", false))
+            (panels(&scores, "normalised score", Scale::Linear))
         } @else {
             p class="note" {
                 "These runs were evaluated at the end only. Scores on the way come with "
@@ -105,7 +106,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
                 "Different algorithms have losses on different scales: follow one line over time, and do not compare the height of two."
             }
             (keys(&losses))
-            (panels(&losses, if positive { "policy loss (logarithmic)" } else { "policy loss" }, positive))
+            (panels(&losses, if positive { "policy loss (logarithmic)" } else { "policy loss" }, scale))
         }
     }
 }

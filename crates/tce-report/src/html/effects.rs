@@ -4,7 +4,8 @@ use maud::{Markup, html};
 use tce_data::{Quality, Shift};
 
 use super::{capital, counted, one, signed, term, title_cell};
-use crate::analysis::{Analysis, Effect, Gap, LEAST, SURE};
+use crate::analysis::{Analysis, Gap};
+use crate::difference::{Difference, ENOUGH, Effect, LEAST, SURE};
 use crate::stats::Estimate;
 use crate::study::agent_title;
 use crate::svg::{self, Axis, Interval, Series};
@@ -18,30 +19,30 @@ pub(super) fn effects(analysis: &Analysis) -> Option<Markup> {
     let methods: Vec<usize> = (0..analysis.methods.len()).filter(|m| gaps.iter().any(|g| g.method == *m)).collect();
     let of = |m: usize| gaps.iter().filter(move |g| g.method == m);
     let ends = gaps.iter().flat_map(|g| {
-        let reach = SURE * g.error.unwrap_or(0.0);
-        [g.points - reach, g.points + reach, 0.0]
+        let reach = SURE * g.difference.error.unwrap_or(0.0);
+        [g.difference.points - reach, g.difference.points + reach, 0.0]
     });
     let axis = Axis::around(ends, 5);
-    let effects = [Effect::Helps, Effect::Harms, Effect::Open, Effect::OneSeed];
     Some(html! {
         p {
             "How many points a method is above the best " (term("baseline", "baseline")) " of each task, the one with the highest mean there. \
              Bars are two standard errors over " (term("seed", "seeds")) " to either side; a dot without one has a single seed. A method helps or harms \
-             where the difference is more than " (SURE) " standard errors and more than " (one(LEAST)) " point."
+             where the difference is more than " (SURE) " standard errors and at least " (one(LEAST)) " point, with at least " (ENOUGH) " seeds of \
+             either; with fewer it is not shown."
         }
         div class="scroll" {
             table {
                 thead { tr {
                     th class="first" { "Method" } th { "Tasks" }
-                    @for effect in effects { th { (capital(effect.word())) } }
+                    @for effect in Effect::ALL { th { (capital(effect.word())) } }
                     th { "Mean difference" } th { "Worst" } th { "Best" }
                 } }
                 tbody { @for &m in &methods {
-                    @let points: Vec<f64> = of(m).map(|g| g.points).collect();
+                    @let points: Vec<f64> = of(m).map(|g| g.difference.points).collect();
                     tr {
                         th scope="row" { (title_cell(analysis, m)) }
                         td { (points.len()) }
-                        @for effect in effects { td { (of(m).filter(|g| g.effect == effect).count()) } }
+                        @for effect in Effect::ALL { td { (of(m).filter(|g| g.difference.effect == effect).count()) } }
                         td { (signed(points.iter().sum::<f64>() / points.len() as f64)) }
                         td { (signed(points.iter().copied().fold(f64::MAX, f64::min))) }
                         td { (signed(points.iter().copied().fold(f64::MIN, f64::max))) }
@@ -49,7 +50,7 @@ pub(super) fn effects(analysis: &Analysis) -> Option<Markup> {
                 } }
             }
         }
-        div class="keys" { @for effect in effects { (svg::dot_key(&Series { title: effect.word().into(), class: class(effect).into() })) } }
+        div class="keys" { @for effect in Effect::ALL { (svg::dot_key(&Series { title: effect.word().into(), class: class(effect).into() })) } }
         div class="panels" {
             @for &m in &methods {
                 @let rows: Vec<Interval> = of(m).map(row).collect();
@@ -68,15 +69,16 @@ fn class(effect: Effect) -> &'static str {
         Effect::Helps => "helps",
         Effect::Harms => "harms",
         Effect::Open => "open",
-        Effect::OneSeed => "f3",
+        Effect::FewSeeds => "f3",
     }
 }
 
 fn row(gap: &Gap) -> Interval {
-    let reach = gap.error.map(|e| SURE * e);
+    let Difference { points, error, effect, .. } = gap.difference;
+    let reach = error.map(|e| SURE * e);
     Interval {
-        series: Series { title: name(gap), class: class(gap.effect).into() },
-        inner: Estimate { point: gap.points, interval: reach.map(|r| (gap.points - r, gap.points + r)) },
+        series: Series { title: name(gap), class: class(effect).into() },
+        inner: Estimate { point: points, interval: reach.map(|r| (points - r, points + r)) },
         outer: None,
     }
 }

@@ -4,7 +4,7 @@ use maud::{Markup, html};
 
 use super::{classes, percent, term};
 use crate::analysis::{Aggregate, Analysis, Comparison};
-use crate::svg::{self, Axis, Frame, Interval, Line, Point, Series};
+use crate::svg::{self, Axis, Frame, Interval, Line, Point, Scale, Series};
 
 pub(super) fn statistics(analysis: &Analysis) -> Markup {
     let Some(c) = &analysis.comparison else { return html! { p { "No run has a score." } } };
@@ -68,7 +68,7 @@ pub(super) fn statistics(analysis: &Analysis) -> Markup {
                     size: (440.0, 300.0),
                     x: ("normalised score", Axis::within(ends, 6)),
                     y: ("share of runs, %", Axis::fixed(0.0, 100.0, &[0.0, 25.0, 50.0, 75.0, 100.0])),
-                    log: false,
+                    scale: Scale::Linear,
                 }, &profile))
                 div class="keys" { @for l in &profile { (svg::key(&l.series)) } }
             }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use serde::Serialize;
 use tce_augment::config::{GuidanceConfig, SingleStageConfig};
 use tce_augment::single_stage::{
-    SingleStage, Trained, enough_to_score, evaluations, rescored, score_streams, training_of,
+    SingleStage, Trained, Under, enough_to_score, evaluations, rescored, score_streams, training_of,
 };
 use tce_augment::work::Work;
 use tce_data::{DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, density_scores, load, save_d4rl};
@@ -165,7 +165,7 @@ pub fn augment_rows(
             kept: table.len(),
             outside_box: sampled.outside_box,
             terminal: table.terminals.iter().filter(|t| **t).count() as f64 / table.len() as f64,
-            evaluations: evaluations(own, scored.is_some()),
+            evaluations: evaluations(own, Under::of(scored.as_ref())),
             labels: None,
         });
     }

@@ -7,7 +7,7 @@ use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied, Labels, Rated,
-    Reliability, Sampled, Spread, gaussian, memorisation,
+    Reliability, Sampled, Spread, Truth, gaussian, memorisation,
 };
 use tce_learn::{Densities, rmse};
 use tce_nn::Device;
@@ -27,6 +27,23 @@ pub const PARTS: [&str; 5] =
     ["rows to measure", "transition models", "coverage and reliability", "choice of λ", "pictures and implied policy"];
 /// Points of each group in a picture.
 const POINTS: usize = 400;
+
+/// Which generated rows are meant.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Part {
+    /// Those that the filter keeps.
+    Kept,
+    /// Those that it rejects.
+    Rejected,
+}
+
+/// What is a point of a picture.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Shown {
+    States,
+    Transitions,
+}
+
 /// What every label bound is measured by.
 struct Measured<'a> {
     models: &'a Models,
@@ -106,7 +123,7 @@ impl Work<'_> {
             covered_by_fresh: references.as_ref().is_some_and(|r| r.by_episode),
             bounds_of_y,
             sampled: self.sampled(own),
-            transitions: self.picture(own, sources.as_ref(), &streams, true),
+            transitions: self.picture(own, sources.as_ref(), &streams, Shown::Transitions),
             states,
             labels: self.labels(label_errors, own, &models)?,
             implied: Some(self.implied(device)?),
@@ -137,7 +154,7 @@ impl Work<'_> {
         let mut states: Vec<(f64, Embedding)> = Vec::new();
         for (y, batch) in batches {
             if states.iter().all(|(other, _)| *other != decimal(*y)) {
-                let picture = self.picture(batch, sources, streams, false);
+                let picture = self.picture(batch, sources, streams, Shown::States);
                 states.extend(picture.map(|p| (decimal(*y), p)));
             }
         }
@@ -167,8 +184,8 @@ impl Work<'_> {
             coverage,
             rejected: batch.rejected(),
             memorisation: held_out.map(compare).transpose()?.flatten(),
-            kept: metrics.reliability(batch, true),
-            outliers: (batch.kept() < batch.len()).then(|| metrics.reliability(batch, false)),
+            kept: metrics.reliability(batch, Part::Kept),
+            outliers: (batch.kept() < batch.len()).then(|| metrics.reliability(batch, Part::Rejected)),
         })
     }
 
@@ -217,14 +234,9 @@ impl Work<'_> {
         Sampled { y_kept: labels(true), y_rejected: labels(false), z: z(&own.rows).0, z_real, real_rejected }
     }
 
-    /// Points of the groups: whole transitions with the nearest source rows among them, or states without.
-    fn picture(
-        &self,
-        batch: &Batch,
-        sources: Option<&Sources>,
-        streams: &Streams,
-        transitions: bool,
-    ) -> Option<Embedding> {
+    /// Points of the groups; where whole transitions are shown, the nearest source rows are one.
+    fn picture(&self, batch: &Batch, sources: Option<&Sources>, streams: &Streams, shown: Shown) -> Option<Embedding> {
+        let transitions = shown == Shown::Transitions;
         let units = self.units();
         let points = |t: &Transitions, name: &str| {
             let rows = few(t, POINTS, streams, &format!("picture/{name}"));
@@ -308,7 +320,8 @@ impl Work<'_> {
         }
         let episodes = target.episodes().iter().map(|e| e.start..e.end).collect();
         let unit = memorisation::HeldOut::new(real, d, episodes)?.and_then(|h| h.median_distance());
-        Ok(ErrorOverDistance::of(pairs, unit, self.simulator.is_some()))
+        let truth = if self.simulator.is_some() { Truth::Simulator } else { Truth::Models };
+        Ok(ErrorOverDistance::of(pairs, unit, truth))
     }
 
     /// Theorem 1 over λ.
@@ -391,7 +404,8 @@ impl Metrics {
         })
     }
 
-    fn reliability(&self, batch: &Batch, kept: bool) -> Reliability {
+    fn reliability(&self, batch: &Batch, part: Part) -> Reliability {
+        let kept = part == Part::Kept;
         let chosen = |v: &Vec<f64>| {
             Spread::of(v.iter().zip(&batch.keep).filter(|(_, k)| **k == kept).map(|(v, _)| *v).collect::<Vec<_>>())
         };

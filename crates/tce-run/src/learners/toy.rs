@@ -17,7 +17,7 @@ use crate::config::EvaluationConfig;
 use crate::error::Result;
 use crate::keys::{explain, presets, schema};
 use crate::layers::{Layered, Preset};
-use crate::learning::{MemberData, learn};
+use crate::policy_training::{MemberData, learn};
 
 /// Behaviour cloning that skips steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, Owner, PROGRAM, read_if_there, sha256_file, write_json, write_json_first};
+use tce_base::{FileError, Owner, PROGRAM, read_json, sha256_file, write_json, write_json_first};
 use tce_nn::Device;
 
 use super::{Entry, Kind, Sweep};
@@ -16,10 +16,10 @@ use crate::augment::{augment_rows, label_models};
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, source_file, target_file};
-use crate::learning::policy_file;
 use crate::mixture::distances_stage;
 use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::pipeline::run;
+use crate::policy_training::policy_file;
 use crate::stage::files_of;
 use crate::variant::Variant;
 use crate::verdict::{Candidate, Verdict, recommend_or_only};
@@ -149,10 +149,7 @@ impl Sweep {
     /// If the record of it is damaged.
     pub fn outcome(&self, entry: &Entry) -> Result<Option<Outcome>> {
         let path = self.file("done", &format!("{}.json", entry.id));
-        let Some(bytes) = read_if_there(&path)? else { return Ok(None) };
-        let outcome: Outcome = serde_json::from_slice(&bytes)
-            .map_err(|e| Error::Failed(format!("{}: {e}; remove it to do the work again", path.display())))?;
-        Ok(Some(outcome))
+        Ok(read_json(&path, "remove it to do the work again")?)
     }
 
     /// The pieces of work that are not done, in the order of the manifest.

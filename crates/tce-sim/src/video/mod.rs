@@ -163,31 +163,31 @@ impl Panel {
         let (torso, solids) = &self.poses[frame.min(self.poses.len() - 1)];
         let camera = Camera::following(recording.agent, *torso, size);
         let mut picture = scene::draw(&camera, solids, View::of(recording.agent).floor, size);
-        let text = |bold, colour| Style::new(size[1], bold, colour);
-        let (line, margin) = (text(false, INK).line(), text(false, INK).advance());
+        let (regular, bold) = (|colour| Style::regular(size[1], colour), |colour| Style::bold(size[1], colour));
+        let (line, margin) = (regular(INK).line(), regular(INK).advance());
         let shift = recording.shift;
         let name =
             if shift == Shift::Source { recording.agent.to_string() } else { format!("{}-{shift}", recording.agent) };
-        text::write(&mut picture, margin, line / 2, &name, text(true, INK));
+        text::write(&mut picture, margin, line / 2, &name, bold(INK));
         let so_far = recording.return_at(step);
         let mut status = format!("step {step:>4}  return {so_far:>7.1}");
         if let Some(reference) = self.reference {
             status += &format!("  score {:>5.1}", reference.normalised_score(so_far));
         }
-        text::write(&mut picture, margin, line / 2 + line, &status, text(false, FAINT));
+        text::write(&mut picture, margin, line / 2 + line, &status, regular(FAINT));
         if step == recording.length() {
             let (mark, colour) = match recording.ending {
                 Ending::Fell => (format!("fell at step {step}"), ALARM),
                 Ending::TimeLimit => (format!("time limit, step {step}"), FAINT),
                 Ending::Unstable => (format!("simulation blew up after step {step}"), ALARM),
             };
-            text::write(&mut picture, margin, line / 2 + 2 * line, &mark, text(true, colour));
+            text::write(&mut picture, margin, line / 2 + 2 * line, &mark, bold(colour));
         }
         let accent = scene::colour(Paint::Changed);
         for (k, entry) in self.legend.iter().rev().enumerate() {
             let top = (size[1] - line / 2).saturating_sub((k + 1) * line);
             picture.fill([margin, top + 4], [line - 10, line - 10], accent);
-            text::write(&mut picture, margin + line, top, entry, text(false, mix(accent, INK, 0.6)));
+            text::write(&mut picture, margin + line, top, entry, regular(mix(accent, INK, 0.6)));
         }
         picture
     }

@@ -14,10 +14,15 @@ pub(super) struct Style {
 
 impl Style {
     /// A style with a letter size that suits a picture of `rows` pixels.
-    pub fn new(rows: usize, bold: bool, colour: Colour) -> Self {
-        let weight = if bold { FontWeight::Bold } else { FontWeight::Regular };
+    pub fn regular(rows: usize, colour: Colour) -> Self {
+        let weight = FontWeight::Regular;
         let size = if rows < 600 { RasterHeight::Size16 } else { RasterHeight::Size24 };
         Self { weight, size, colour }
+    }
+
+    /// The same in bold.
+    pub fn bold(rows: usize, colour: Colour) -> Self {
+        Self { weight: FontWeight::Bold, ..Self::regular(rows, colour) }
     }
 
     /// Distance between two lines, in pixels.
@@ -51,7 +56,7 @@ mod tests {
 
     #[test]
     fn letters_stay_in_their_box_and_in_the_picture() {
-        let style = Style::new(360, false, [0, 0, 0]);
+        let style = Style::regular(360, [0, 0, 0]);
         let mut picture = Picture::new(60, 30, [255; 3]);
         write(&mut picture, 5, 4, "H×", style);
         let dark: Vec<_> = (0..30)

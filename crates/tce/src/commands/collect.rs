@@ -6,7 +6,7 @@ use clap::Args;
 use serde::Serialize;
 use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, parse_environment, reference_scores, save_d4rl};
 use tce_run::error::{Error, Result};
-use tce_run::inputs::d4rl_recipe;
+use tce_run::inputs::{Actors, d4rl_recipe};
 use tce_sim::EPISODE_LIMIT;
 use tce_zoo::exhibits;
 use tce_zoo::recipes::{Part, Recipe};
@@ -67,7 +67,7 @@ impl Collect {
         let recipe = match self.quality {
             Some(quality) => {
                 let recipe = if shift == Shift::Source {
-                    d4rl_recipe(agent, quality, self.rows, self.seed, false)?
+                    d4rl_recipe(agent, quality, self.rows, self.seed, Actors::ZooOrShared)?
                 } else {
                     let recipe = exhibits::cast(agent, shift)?.source(agent, shift, quality, self.rows, self.seed);
                     recipe.ok_or_else(|| {

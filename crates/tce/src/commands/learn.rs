@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use tce_base::plus_minus;
-use tce_learn::About;
+use tce_learn::{About, LearnedRows};
 use tce_nn::Device;
 use tce_run::config::Algorithm;
 use tce_run::error::Result;
@@ -67,7 +67,7 @@ impl Learn {
         self.config = self.config.with_own_tables(self.learner, self.top);
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        ensure_fits(&config.learner, self.extra.is_some())?;
+        ensure_fits(&config.learner, LearnedRows::with(self.extra.as_ref()))?;
         super::refuse::folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);

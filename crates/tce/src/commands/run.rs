@@ -16,7 +16,7 @@ use tce_run::pipeline::{Summary, run, seeds};
 use tce_run::variant::Variant;
 use tce_run::verdict::{Candidate, Kept, keep, recommend_or_only};
 
-use crate::conclusion::{self, Scored};
+use crate::conclusion::{self, Role, Scored};
 use crate::output::{Output, heading, mark_best, table};
 
 /// Arguments of `run`.
@@ -115,7 +115,8 @@ impl Run {
         };
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
         let scored = |row: &Row| {
-            Scored::new(&row.title, row.baseline, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
+            let role = if row.baseline { Role::Baseline } else { Role::Method };
+            Scored::new(&row.title, role, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
         };
         let recommended = verdict.as_ref().map(|v| v.verdict.method.as_str());
         let scored: Vec<_> = rows.iter().map(scored).collect();
@@ -132,7 +133,7 @@ impl Run {
         course.step("data", serde_json::json!(self.task));
         for ((variant, _), config) in variants.iter().zip(configs) {
             course.generating(config);
-            course.learning(variant.name(), config, config.mixture.has_other_rows());
+            course.training(variant.name(), config, config.mixture.learned_rows());
         }
         if !self.no_verdict {
             course.verdict(&configs[0]);

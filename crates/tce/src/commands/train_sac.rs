@@ -96,9 +96,56 @@ struct Row {
     steps_per_second: f64,
 }
 
+/// A training and where it is.
+struct Begun {
+    environment: String,
+    seed: u64,
+    directory: PathBuf,
+    training: Training,
+    /// Why it does not go on.
+    fault: Option<Error>,
+    /// The steps that an earlier command took.
+    before: u64,
+}
+
 impl TrainSac {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
+        self.refuse()?;
+        tce_sim::open_library()?;
+        let mut trainings = self.begin(device)?;
+        let started = std::time::Instant::now();
+        // A training that fails does not take the others with it.
+        while trainings.iter().any(|t| t.fault.is_none() && !t.training.finished()) {
+            on_threads_of(device, || {
+                trainings.par_iter_mut().filter(|t| t.fault.is_none()).for_each(|t| {
+                    t.fault = t.training.advance(TURN).err().map(Error::from);
+                });
+            });
+        }
+        let seconds = started.elapsed().as_secs_f64();
+        let (mut rows, mut faults) = (Vec::new(), Vec::new());
+        for Begun { environment, seed, directory, training, fault, before } in trainings {
+            if self.replay {
+                save_d4rl(&directory.join("medium-replay.hdf5"), training.replay(), &Default::default(), &[])?;
+            }
+            faults.extend(fault.map(|fault| (format!("{environment} seed {seed}"), fault)));
+            let ledger = training.ledger().clone();
+            let steps_per_second = (ledger.step - before) as f64 / seconds;
+            rows.push(Row { environment, seed, directory, ledger, steps_per_second });
+        }
+        if tce_base::interrupted() {
+            return Err(Error::interrupted());
+        }
+        output.print(&rows, |rows| {
+            let head = ["training", "steps", "return", "score", "snapshots", "steps/s", "directory"];
+            table(&head, rows.iter().map(Row::cells))
+        });
+        failed(faults)
+    }
+
+    /// Refuses arguments out of range.
+    fn refuse(&self) -> Result<()> {
         let counts =
             [self.steps, self.seeds, self.episodes as u64, self.evaluate_every, self.start, self.steps_per_update];
         if counts.contains(&0) || self.batch == 0 {
@@ -109,96 +156,84 @@ impl TrainSac {
             return Err(Error::Usage(format!("--explore {}: expected a share from 0 to 1", self.explore)));
         }
         super::refuse::folder(&self.out)?;
-        let goal = Goal {
-            steps: self.steps,
-            until: self.until_score,
-            snapshots: self.snapshot_scores,
-            checkpoint_every: self.checkpoint_every,
-        };
-        let mut trainings = Vec::new();
         for (k, environment) in self.environments.iter().enumerate() {
             if self.environments[..k].contains(environment) {
                 return Err(Error::Usage(format!("{}-{} is named twice", environment.0, environment.1)));
             }
         }
-        tce_sim::open_library()?;
+        Ok(())
+    }
+
+    /// Starts or resumes all trainings.
+    fn begin(&self, device: &Device) -> Result<Vec<Begun>> {
+        let goal = Goal {
+            steps: self.steps,
+            until: self.until_score,
+            snapshots: self.snapshot_scores.clone(),
+            checkpoint_every: self.checkpoint_every,
+        };
+        let mut trainings = Vec::new();
         for &(agent, shift) in &self.environments {
             for seed in self.seed..self.seed + self.seeds {
-                let settings = Settings {
-                    agent,
-                    shift,
-                    seed,
-                    start: self.start,
-                    steps_per_update: self.steps_per_update,
-                    explore: self.explore,
-                    batch: self.batch,
-                    from: None,
-                    evaluate_every: self.evaluate_every,
-                    episodes: self.episodes,
-                    sac: SacConfig {
-                        policy_start: self.policy_start,
-                        initial_alpha: self.temperature,
-                        layer_norm: self.critic_norm,
-                        target_entropy: self.target_entropy,
-                        policy_lr: self.policy_lr,
-                        ..SacConfig::default()
-                    },
-                };
-                let directory = self.out.join(format!("{agent}-{shift}-seed{seed}"));
+                let environment = format!("{agent}-{shift}");
+                let directory = self.out.join(format!("{environment}-seed{seed}"));
+                let settings = self.settings(agent, shift, seed);
                 let training = Training::open(&directory, settings, self.from.as_deref(), goal.clone(), device)?;
-                trainings.push((format!("{agent}-{shift}"), seed, directory, training));
+                let before = training.ledger().step;
+                trainings.push(Begun { environment, seed, directory, training, fault: None, before });
             }
         }
-        let mut faults: Vec<Option<Error>> = trainings.iter().map(|_| None).collect();
-        let started = std::time::Instant::now();
-        let before: Vec<u64> = trainings.iter().map(|t| t.3.ledger().step).collect();
-        // A training that fails does not take the others with it.
-        while trainings.iter().zip(&faults).any(|(t, fault)| fault.is_none() && !t.3.finished()) {
-            on_threads_of(device, || {
-                trainings.par_iter_mut().zip(&mut faults).for_each(|(t, fault)| {
-                    if fault.is_none() {
-                        *fault = t.3.advance(TURN).err().map(Error::from);
-                    }
-                });
-            });
+        Ok(trainings)
+    }
+
+    fn settings(&self, agent: Agent, shift: Shift, seed: u64) -> Settings {
+        Settings {
+            agent,
+            shift,
+            seed,
+            start: self.start,
+            steps_per_update: self.steps_per_update,
+            explore: self.explore,
+            batch: self.batch,
+            from: None,
+            evaluate_every: self.evaluate_every,
+            episodes: self.episodes,
+            sac: SacConfig {
+                policy_start: self.policy_start,
+                initial_alpha: self.temperature,
+                layer_norm: self.critic_norm,
+                target_entropy: self.target_entropy,
+                policy_lr: self.policy_lr,
+                ..SacConfig::default()
+            },
         }
-        let seconds = started.elapsed().as_secs_f64();
-        let mut rows = Vec::new();
-        for ((environment, seed, directory, training), before) in trainings.into_iter().zip(before) {
-            if self.replay {
-                save_d4rl(&directory.join("medium-replay.hdf5"), training.replay(), &Default::default(), &[])?;
-            }
-            let ledger = training.ledger().clone();
-            let steps_per_second = (ledger.step - before) as f64 / seconds;
-            rows.push(Row { environment, seed, directory, ledger, steps_per_second });
-        }
-        if tce_base::interrupted() {
-            return Err(Error::interrupted());
-        }
-        output.print(&rows, |rows| {
-            let lines = rows.iter().map(|r| {
-                let last = r.ledger.evaluations.last();
-                [
-                    format!("{} seed {}", r.environment, r.seed),
-                    r.ledger.step.to_string(),
-                    last.map_or("-".into(), |e| format!("{:.0} ± {:.0}", e.mean, e.std)),
-                    last.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
-                    r.ledger.snapshots.len().to_string(),
-                    format!("{:.0}", r.steps_per_second),
-                    r.directory.display().to_string(),
-                ]
-            });
-            table(&["training", "steps", "return", "score", "snapshots", "steps/s", "directory"], lines)
-        });
-        let mut faults = rows.iter().zip(faults).filter_map(|(row, fault)| Some((row, fault?)));
-        match (faults.next(), faults.next()) {
-            (None, _) => Ok(()),
-            (Some((_, fault)), None) => Err(fault),
-            (Some(one), Some(two)) => {
-                let all = [one, two].into_iter().chain(faults);
-                let lines = all.map(|(row, fault)| format!("{} seed {}: {fault}", row.environment, row.seed));
-                Err(Error::Failed(lines.collect::<Vec<_>>().join("\n")))
-            }
+    }
+}
+
+impl Row {
+    /// In the table.
+    fn cells(&self) -> [String; 7] {
+        let last = self.ledger.evaluations.last();
+        [
+            format!("{} seed {}", self.environment, self.seed),
+            self.ledger.step.to_string(),
+            last.map_or("-".into(), |e| format!("{:.0} ± {:.0}", e.mean, e.std)),
+            last.and_then(|e| e.score).map_or("-".into(), |s| format!("{s:.1}")),
+            self.ledger.snapshots.len().to_string(),
+            format!("{:.0}", self.steps_per_second),
+            self.directory.display().to_string(),
+        ]
+    }
+}
+
+/// The error of trainings that failed, with their names where there are several.
+fn failed(mut faults: Vec<(String, Error)>) -> Result<()> {
+    match faults.len() {
+        0 => Ok(()),
+        1 => Err(faults.remove(0).1),
+        _ => {
+            let lines: Vec<_> = faults.iter().map(|(name, fault)| format!("{name}: {fault}")).collect();
+            Err(Error::Failed(lines.join("\n")))
         }
     }
 }

@@ -184,11 +184,11 @@ impl Rollout {
         } else {
             self.names.iter().map(|n| Exhibit::find(n)).collect::<tce_zoo::Result<_>>()?
         };
+        let actions = Actions::mean_if(self.mean);
         let mut all = Vec::new();
         for exhibit in exhibits {
             let card = exhibit.card()?;
-            let evaluation =
-                evaluate_card(&exhibit.policy()?, &card, self.episodes, Streams::new(self.seed), self.mean)?;
+            let evaluation = evaluate_card(&exhibit.policy()?, &card, self.episodes, Streams::new(self.seed), actions)?;
             all.push(Rolled { name: exhibit.name.to_owned(), card, evaluation });
         }
         output.print(&all, |all| {
@@ -209,9 +209,15 @@ impl Rollout {
     }
 }
 
-fn evaluate_card(policy: &Policy, card: &Card, episodes: usize, streams: Streams, mean: bool) -> Result<Evaluation> {
+fn evaluate_card(
+    policy: &Policy,
+    card: &Card,
+    episodes: usize,
+    streams: Streams,
+    actions: Actions,
+) -> Result<Evaluation> {
     let arena = Arena::new(card.agent, card.shift, ScoreTable::default());
-    Ok(evaluate(policy, arena, episodes, streams, Actions::mean_if(mean), interrupted)?)
+    Ok(evaluate(policy, arena, episodes, streams, actions, interrupted)?)
 }
 
 impl Keep {
@@ -250,7 +256,7 @@ impl Keep {
         let mut parameters = full.to_half();
         let policy = Policy::from_parameters(&parameters, &self.policy)?;
         let streams = Streams::new(card.seed ^ u64::MAX);
-        let evaluation = evaluate_card(&policy, &card, self.episodes, streams, false)?;
+        let evaluation = evaluate_card(&policy, &card, self.episodes, streams, Actions::Sampled)?;
         let (mean, std) = mean_std(&evaluation.returns);
         let (length, score, episodes) = (evaluation.mean_length(), evaluation.score, self.episodes);
         let card = Card { role: Some(self.role), episodes, mean, std, length, score, ..card };

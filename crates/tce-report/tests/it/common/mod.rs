@@ -10,7 +10,7 @@ use tce_base::sha256_hex;
 use tce_data::{Agent, Quality, Shift, Task};
 use tce_diagnosis::{
     AtBound, Bounds, Choice, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Histogram, Implied,
-    ImpliedActions, ImpliedErrors, ImpliedRollout, Labels, Memorisation, Rated, Reliability, Sampled, Spread,
+    ImpliedActions, ImpliedErrors, ImpliedRollout, Labels, Memorisation, Rated, Reliability, Sampled, Spread, Truth,
 };
 use tce_report::{Method, Options, Recipe, Run, RunFolder, Study};
 
@@ -213,7 +213,7 @@ pub fn diagnosis(task: Option<Task>) -> Diagnosis {
         error_over_distance: ErrorOverDistance::of(
             (1..=100).map(|i| (0.01 * f64::from(i), 0.02 * f64::from(i))).collect(),
             Some(0.3),
-            true,
+            Truth::Simulator,
         ),
         choice: curve.as_ref().map(Choice::of),
         choice_by_simulator: curve.as_ref().map(Choice::of),

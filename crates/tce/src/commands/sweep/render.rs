@@ -8,7 +8,7 @@ use tce_run::sweep::gather::Gathered;
 use tce_run::sweep::status::Status;
 use tce_run::variant::Variant;
 
-use crate::conclusion::{Scored, Tally};
+use crate::conclusion::{Role, Scored, Tally};
 use crate::output::{mark_best, table};
 
 /// As a text for a terminal.
@@ -98,17 +98,20 @@ pub fn gathered(gathered: &Gathered) -> String {
     text
 }
 
-/// For every method that is no baseline: on how many tasks it is above and below the best baseline, and where by more than seeds do.
+/// For every method that is no baseline: on how many tasks it is above and below the best baseline, and where that is shown.
 fn sentences(tasks: &[&str], methods: &[&str], cells: &BTreeMap<(&str, &str), Vec<f64>>) -> Vec<String> {
     // Without baselines there is nothing to be above of.
-    let baseline = |method: &str| Variant::BASELINES.iter().any(|f| method.split(' ').next() == Some(f.name()));
+    let role = |method: &str| match Variant::BASELINES.iter().any(|f| method.split(' ').next() == Some(f.name())) {
+        true => Role::Baseline,
+        false => Role::Method,
+    };
     let of = |method: &str| {
         Tally::of(tasks.iter().map(|task| {
-            let scored =
-                |m: &str| cells.get(&(*task, m)).filter(|s| !s.is_empty()).map(|s| Scored::new(m, baseline(m), s));
-            let baselines: Vec<Scored> = methods.iter().filter(|m| baseline(m)).filter_map(|m| scored(m)).collect();
+            let scored = |m: &str| cells.get(&(*task, m)).filter(|s| !s.is_empty()).map(|s| Scored::new(m, role(m), s));
+            let baselines: Vec<Scored> =
+                methods.iter().filter(|m| role(m) == Role::Baseline).filter_map(|m| scored(m)).collect();
             (scored(method), baselines)
         }))
     };
-    methods.iter().filter(|m| !baseline(m)).filter_map(|m| of(m).map(|tally| tally.sentence(m))).collect()
+    methods.iter().filter(|m| role(m) == Role::Method).filter_map(|m| of(m).map(|tally| tally.sentence(m))).collect()
 }

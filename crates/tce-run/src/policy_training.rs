@@ -10,8 +10,8 @@ use tce_base::metrics::{Line, Metrics};
 use tce_base::{Streams, interrupted};
 use tce_data::{Standardizer, Transitions, even_standardizer};
 use tce_learn::{
-    Buffer, Journal, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, TrainingJob, best_trajectories,
-    return_range_scale, train_side_by_side,
+    Buffer, Journal, LearnedRows, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, TrainingJob,
+    best_trajectories, return_range_scale, train_side_by_side,
 };
 use tce_nn::{Device, is_cpu};
 use tce_sim::SimError;
@@ -88,8 +88,8 @@ pub fn learn(
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<Learned> {
     let started = std::time::Instant::now();
-    let mixed = data.iter().any(|d| d.extra.is_some());
-    let config = &LearnerConfig { steps: config.steps(mixed), ..config.clone() };
+    let rows = LearnedRows::with(data.iter().find_map(|d| d.extra.as_ref()));
+    let config = &LearnerConfig { steps: config.steps(rows), ..config.clone() };
     let journal = Journal::default();
     let place = Place { directory: Some(directory), key, job: 0, journal: Some(&journal) };
     let seeds: Vec<_> = data.iter().map(|d| d.seed).collect();
@@ -168,8 +168,8 @@ fn job(
     device: &Device,
 ) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
     let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
-    let mixed = data.iter().any(|d| d.extra.is_some());
-    let buffer = Buffer::new(members, config.batch())?.fading(config.fade(mixed));
+    let rows = LearnedRows::with(data.iter().find_map(|d| d.extra.as_ref()));
+    let buffer = Buffer::new(members, config.batch())?.fading(config.fade(rows));
     let learner = build(&buffer, config, place, device)?;
     Ok((buffer, learner))
 }
