@@ -59,10 +59,11 @@ def test_vector_environments_count_whole_episodes():
 
     single = tce.evaluate(policy, arm.Arm(), episodes=6, seed=0)
     assert list(single.lengths) == [arm.STEPS] * 6
-    for mode in gymnasium.vector.AutoresetMode:
-        if mode.name == "DISABLED":
-            continue
-        lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 3, autoreset_mode=mode)
+    # gymnasium before 1.1 has one mode, and no name for it.
+    modes = [m for m in getattr(gymnasium.vector, "AutoresetMode", [None]) if m is None or m.name != "DISABLED"]
+    for mode in modes:
+        options = {} if mode is None else {"autoreset_mode": mode}
+        lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 3, **options)
         found = tce.evaluate(policy, lanes, episodes=6, seed=0)
         assert list(found.lengths) == [arm.STEPS] * 6, mode
         assert abs(found.mean - single.mean) < 25, (mode, found, single)

@@ -134,7 +134,8 @@ def test_an_error_in_a_callback_stops_the_work(target):
 
 
 def test_ctrl_c_stops_at_a_checkpoint_and_the_same_call_continues(target, tmp_path):
-    call = dict(config={**TINY, "learner.steps": 6000}, compare=False)
+    # So long that the signal comes before the end, whatever else the machine does.
+    call = dict(config={**TINY, "learner.steps": 30_000}, compare=False)
 
     def press(label, done, total, unit, seconds):
         if done > 300:
@@ -147,7 +148,7 @@ def test_ctrl_c_stops_at_a_checkpoint_and_the_same_call_continues(target, tmp_pa
     tce.train(target, out=tmp_path / "whole", **call)
     name = "policy-seed0.safetensors"
     assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    assert starts[0][1] < 6000, "it went on from a checkpoint"
+    assert starts[0][1] < 30_000, "it went on from a checkpoint"
 
 
 def test_python_runs_on_while_the_program_works(target):

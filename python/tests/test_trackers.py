@@ -15,6 +15,8 @@ def test_wandb_offline(target, tmp_path, monkeypatch):
     run = wandb.init(project="tce", dir=tmp_path)
     tce.train(target, config=TINY, compare=False, seeds=2, callback=tce.callbacks.wandb(run))
     run.finish()
+    # The service behind wandb may still be writing.
+    wandb.teardown()
     # Names stand in the file as they are.
     written = b"".join(path.read_bytes() for path in tmp_path.rglob("*.wandb"))
     assert b"seed0/learn/step" in written and b"seed1/learn/step" in written
