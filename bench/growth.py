@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""How the cost of `tce augment` grows with the work: python3 bench/growth.py [--out FILE] [--only NAME]
+"""How the cost of `tce augment` grows with the work: python3 bench/growth.py [--out FILE] [--only NAME] [--draw FIGURE.svg]
 
 Made-up data of a stable linear system with noise (costs do not depend on what the numbers say), in files as a user has them. One thing grows
 at a time, from a base of 5 000 target rows, 1M source rows, 17 dimensions and 100 000 generated rows: target rows, source rows,
-dimensions, generated rows. Every call trains each network for 300 updates only, because updates cost the same whatever the number of rows;
+dimensions, generated rows. Every call uses one core, and trains each network for 300 updates only, because updates cost the same whatever the number of rows;
 what is measured is the rest: wall time, time of each stage, and peak memory. Needs numpy and h5py, and `cargo build --release` before it."""
 import argparse
 import json
@@ -58,7 +58,7 @@ def measure(size, folder):
     write(target, size["target"], size["dims"], 0.8, 2)
     cache = os.path.join(folder, "cache")
     shutil.rmtree(cache, ignore_errors=True)
-    command = [os.path.join(ROOT, "target", "release", "tce"), "augment", "--source", source, "--target", target]
+    command = [os.path.join(ROOT, "target", "release", "tce"), "--threads", "1", "augment", "--source", source, "--target", target]
     command += ["--out", os.path.join(folder, "wider.hdf5"), "--force", "--cache", cache]
     for setting in [*SETTINGS, f"generator.rows={size['generated']}"]:
         command += ["--set", setting]
@@ -73,14 +73,38 @@ def measure(size, folder):
     return {"size": size, "seconds": seconds, "cpu": usage.ru_utime + usage.ru_stime, "gib": usage.ru_maxrss / 2**20, "written_gb": written / 1e9}
 
 
+def draw(found, path):
+    """Seconds and peak memory against each size, in four panels. Needs matplotlib."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    import matplotlib.pyplot as plt
+
+    names = {"target": "target rows", "source": "source rows", "dims": "dimensions of the state", "generated": "generated rows"}
+    figure, panels = plt.subplots(1, 4, figsize=(12, 2.8), layout="constrained")
+    for panel, (name, sizes) in zip(panels, SERIES.items()):
+        series = [f for value in sizes for f in found if f["size"] == BASE | {name: value}]
+        xs = [f["size"][name] for f in series]
+        for key, label, colour in (("seconds", "seconds, one core", "#1f5a87"), ("gib", "peak memory, GiB", "#b8651b")):
+            panel.plot(xs, [f[key] for f in series], "o-", color=colour, label=label, ms=4, lw=1.5)
+        panel.set(xscale="log", yscale="log", xlabel=names[name], ylim=(0.1, 400))
+        panel.grid(alpha=0.25)
+    panels[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
 def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("--out", default=os.path.join(ROOT, "bench", "growth.json"))
     arguments.add_argument("--only", choices=SERIES)
+    arguments.add_argument("--draw", help="draw what is there, and measure nothing")
     arguments = arguments.parse_args()
     folder = os.path.join(ROOT, "target", "growth")
     os.makedirs(folder, exist_ok=True)
     found = json.load(open(arguments.out)) if os.path.exists(arguments.out) else []
+    if arguments.draw:
+        draw(found, arguments.draw)
+        return 0
     for name, sizes in SERIES.items():
         if arguments.only not in (None, name):
             continue

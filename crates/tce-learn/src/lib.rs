@@ -32,7 +32,7 @@ pub use crate::algorithms::{
     bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac, selection,
     srpo, td3_bc,
 };
-use crate::core::{blocks, buffer, mode, training};
+use crate::core::{blocks, buffer, mode, shares, training};
 pub use crate::core::{losses, sequences};
 use crate::models::{context_encoder, contexts, networks};
 pub use crate::models::{

@@ -385,19 +385,20 @@ mod tests {
     }
 
     #[test]
-    fn mixtures_are_cloned_for_fewer_steps() {
-        let mut learner = layered(Preset::Default, None, &[]).unwrap().config().unwrap().learner;
-        assert_eq!(
-            (learner.algorithm, learner.steps(LearnedRows::Target), learner.steps(LearnedRows::Mixed)),
-            (Algorithm::Bc, 50_000, 15_000)
-        );
-        learner.steps = 300;
-        assert_eq!(learner.steps(LearnedRows::Mixed), 300, "it is no more than was asked for");
-        learner.steps = 50_000;
+    fn other_rows_fade_or_are_cloned_for_fewer_steps() {
+        let of = |preset, set: &[&str]| layered(preset, None, set).unwrap().config().unwrap().learner;
+        let mut learner = of(Preset::Default, &[]);
+        assert_eq!(learner.steps(LearnedRows::Mixed), 50_000);
+        assert_eq!(learner.fade(LearnedRows::Mixed), Some(30_000));
         learner.algorithm = Algorithm::Iql;
-        assert_eq!(learner.steps(LearnedRows::Mixed), 50_000, "clones alone");
-        let paper = layered(Preset::Paper, None, &["learner.algorithm=bc"]).unwrap().config().unwrap().learner;
-        assert_eq!(paper.steps(LearnedRows::Mixed), paper.steps);
+        assert_eq!(learner.fade(LearnedRows::Mixed), None, "clones alone");
+        let mut short = of(Preset::Default, &["learner.bc.mixed_steps=15_000"]);
+        assert_eq!((short.steps(LearnedRows::Target), short.steps(LearnedRows::Mixed)), (50_000, 15_000));
+        assert_eq!(short.fade(LearnedRows::Mixed), Some(9_000), "of the steps that are done");
+        short.steps = 300;
+        assert_eq!(short.steps(LearnedRows::Mixed), 300, "it is no more than was asked for");
+        let paper = of(Preset::Paper, &["learner.algorithm=bc"]);
+        assert_eq!((paper.steps(LearnedRows::Mixed), paper.fade(LearnedRows::Mixed)), (paper.steps, None));
     }
 
     #[test]

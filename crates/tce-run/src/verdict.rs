@@ -3,13 +3,14 @@
 //! Every policy is tried from the same target states in the same learned models, so that two policies are compared episode by
 //! episode. The rule, measured in bench/expansion.md:
 //!
-//! 1. The standard is the baseline whose imagined return is highest.
-//! 2. A method is recommended instead if its imagined episodes return more than the standard's, by more than [`SURE`] standard errors of
-//!    the paired differences and by more than [`LEAST`] of the standard's return. Of several, the one with the highest return.
-//! 3. Of several seeds of the recommended method, the one with the highest imagined return is taken.
+//! 1. The standard is the baseline whose supported return is highest.
+//! 2. A method is recommended instead if its imagined episodes return more than the standard's while they are near the target's states, by
+//!    more than [`SURE`] standard errors of the paired differences and by more than [`LEAST`] of the standard's return. Of several, the one
+//!    with the highest return.
+//! 3. Of several seeds of the recommended method, the one with the highest supported return is taken.
 //!
-//! Learned dynamics have errors, above all away from the data. If the difference is smaller than what they can resolve, the baseline
-//! is recommended.
+//! Learned dynamics have errors, above all away from the data: there they invent returns, and nothing counts. If the difference is smaller
+//! than what they can resolve, the baseline is recommended.
 
 use std::path::{Path, PathBuf};
 
@@ -49,7 +50,10 @@ pub struct Tried {
     pub baseline: bool,
     /// Imagined return, mean over the seeds.
     pub imagined_return: f64,
-    /// Standard error of it, over the imagined episodes of the policies' mean.
+    /// What of it is near the target's states, which decides; none in verdicts from before December 2026.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub supported_return: Option<f64>,
+    /// Standard error of what decides, over the imagined episodes of the policies' mean.
     #[serde(default)]
     pub standard_error: f64,
     /// Share of the steps of whole episodes that were reached, mean over the seeds.
@@ -83,11 +87,11 @@ pub struct Verdict {
     pub behaviour_value: Option<f64>,
 }
 
-/// Mean over the seeds of every imagined episode's return.
+/// Mean over the seeds of every imagined episode's supported return.
 fn episodes(estimates: &[OffPolicyEstimate]) -> Vec<f64> {
     let count = estimates.len().max(1) as f64;
-    let n = estimates.first().map_or(0, |j| j.returns.len());
-    (0..n).map(|i| estimates.iter().map(|j| j.returns[i]).sum::<f64>() / count).collect()
+    let n = estimates.first().map_or(0, |j| j.supported.len());
+    (0..n).map(|i| estimates.iter().map(|j| j.supported[i]).sum::<f64>() / count).collect()
 }
 
 /// Mean and its standard error.
@@ -178,7 +182,7 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
     let reason = match (next_best, gap) {
         (Some(k), Some([by, error])) if chosen != standard => {
             format!(
-                "{} is recommended: tried in learned dynamics it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
+                "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
                 name(chosen),
                 mean(chosen),
                 name(standard),
@@ -186,7 +190,7 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
             ) + if k == standard { "" } else { " The next best is not a baseline." }
         }
         (Some(k), Some([by, error])) => format!(
-            "{} is recommended: tried in learned dynamics no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
+            "{} is recommended: tried in learned dynamics, near the target's states, no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
             name(chosen),
             if by >= 0.0 { "it is ahead by" } else { "it is behind by" },
             name(k),
@@ -194,14 +198,15 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
         _ => format!("{} is the only method there is.", name(chosen)),
     };
     let seed = (0..estimates[chosen].len())
-        .max_by(|&a, &b| estimates[chosen][a].imagined_return.total_cmp(&estimates[chosen][b].imagined_return));
+        .max_by(|&a, &b| estimates[chosen][a].supported_return.total_cmp(&estimates[chosen][b].supported_return));
     let of_seeds = |k: usize, metric: &dyn Fn(&OffPolicyEstimate) -> f64| {
         mean_std(&estimates[k].iter().map(metric).collect::<Vec<_>>()).0
     };
     let tried = |k: usize| Tried {
         name: candidates[k].name.clone(),
         baseline: candidates[k].baseline,
-        imagined_return: mean(k),
+        imagined_return: of_seeds(k, &|j| j.imagined_return),
+        supported_return: Some(mean(k)),
         standard_error: mean_and_error(&returns[k])[1],
         survival: of_seeds(k, &|j| j.survival),
         action_error: of_seeds(k, &|j| j.action_error),
@@ -263,6 +268,7 @@ mod tests {
             distance: 1.0,
             action_error: 0.1,
             returns: returns.to_vec(),
+            supported: returns.to_vec(),
         }
     }
 

@@ -19,6 +19,7 @@ use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{Device, Tensor, tensor};
 
 use crate::error::LearnError;
+use crate::shares::{faded, split};
 
 /// The data of one member of a population.
 #[derive(Clone, Debug)]
@@ -178,15 +179,8 @@ impl Buffer {
 
     /// Rows of each of `parts` in the batch of `step`.
     fn split(&self, step: u64, parts: &[Arc<Transitions>]) -> Vec<usize> {
-        let mut rows = split(self.batch, parts);
-        let Some(until) = self.fade.filter(|until| *until > 0) else { return rows };
-        let left = until.saturating_sub(step);
-        for k in 1..rows.len() {
-            let kept = (rows[k] as u64 * left).div_ceil(until) as usize;
-            rows[0] += rows[k] - kept;
-            rows[k] = kept;
-        }
-        rows
+        let rows = split(self.batch, parts);
+        self.fade.map_or(rows.clone(), |until| faded(rows, step, until))
     }
 
     /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent. Observations
@@ -317,20 +311,6 @@ impl Buffer {
         let z = &member.standardizer;
         out.extend(self.inputs.iter().map(|&d| (row[d] - z.mean[d]) / z.std[d]));
     }
-}
-
-/// Splits `batch` rows evenly over the parts that have rows; the remainder goes to the earlier parts.
-pub(crate) fn split(batch: usize, parts: &[Arc<Transitions>]) -> Vec<usize> {
-    let live = parts.iter().filter(|p| !p.is_empty()).count();
-    let mut given = 0;
-    let share = |p: &Arc<Transitions>| {
-        if p.is_empty() {
-            return 0;
-        }
-        given += 1;
-        batch / live + usize::from(given <= batch % live)
-    };
-    parts.iter().map(share).collect()
 }
 
 /// How rewards are scaled before they reach a critic.

@@ -5,4 +5,5 @@ pub(crate) mod buffer;
 pub mod losses;
 pub(crate) mod mode;
 pub mod sequences;
+pub(crate) mod shares;
 pub(crate) mod training;

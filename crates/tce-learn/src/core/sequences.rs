@@ -20,7 +20,8 @@ use std::sync::Arc;
 use rand::RngExt;
 use tce_data::Transitions;
 
-use crate::buffer::{Buffer, Member, Pick, split};
+use crate::buffer::{Buffer, Member, Pick};
+use crate::shares::split;
 
 /// The starts of the episodes of a member's tables, and the return to go of each row.
 #[derive(Clone, Debug)]

@@ -107,7 +107,8 @@ fn render(report: &Trained) -> String {
         let rows = kept.verdict.tried.iter().map(|t| {
             [
                 if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
-                format!("{:.1} ± {:.1}", t.imagined_return, t.standard_error),
+                format!("{:.1}", t.imagined_return),
+                format!("{:.1} ± {:.1}", t.supported_return.unwrap_or(t.imagined_return), t.standard_error),
                 format!("{:.0} %", 100.0 * t.survival),
                 t.fitted_q.map_or("-".into(), |[value, error]| format!("{value:.1} ± {error:.1}")),
                 format!("{:.3}", t.action_error),
@@ -115,12 +116,13 @@ fn render(report: &Trained) -> String {
         });
         let logged = kept.verdict.behaviour_value.map(|value| {
             let name = "the target's logged episodes".to_owned();
-            [name, "-".into(), "-".into(), format!("{value:.1}"), "0".into()]
+            [name, "-".into(), "-".into(), "-".into(), format!("{value:.1}"), "0".into()]
         });
-        let header = ["policy", "imagined return", "of an episode survived", "fitted Q", "action error"];
+        let header = ["policy", "imagined return", "supported", "of an episode survived", "fitted Q", "action error"];
         text += &format!(
             "\nEstimated without a simulator (± standard error):\n{}\n\
              imagined return: of episodes in learned dynamics of the robot\n\
+             supported: as much of it as is near the target's states; it decides\n\
              fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
              action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n\n{}",
             table(&header, rows.chain(logged)),
