@@ -85,8 +85,8 @@ fn a_plan_reads_back_and_damage_is_noticed() {
 
 #[test]
 fn tasks_without_data_are_refused_or_left_out() {
-    // The zoo has no actors of ant-gravity-5.
-    let two = "tasks = [\"hopper-morph:medium->expert\", \"ant-gravity-5:medium->medium\"]\nvariants = [\"bc\"]\nfrom_zoo = true\n";
+    // The zoo has no expert of ant-gravity-5.
+    let two = "tasks = [\"hopper-morph:medium->expert\", \"ant-gravity-5:medium->expert\"]\nvariants = [\"bc\"]\nfrom_zoo = true\n";
     let message = plan(two).unwrap_err().to_string();
     assert!(message.contains("not all data can be had") && message.contains("ant-gravity-5"), "{message}");
     let manifest = plan(&format!("{two}unavailable = \"skip\"\n")).unwrap();
