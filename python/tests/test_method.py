@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import logging
 import os
@@ -141,8 +142,13 @@ def test_ctrl_c_stops_at_a_checkpoint_and_the_same_call_continues(target, tmp_pa
         if done > 300:
             os.kill(os.getpid(), signal.SIGINT)
 
-    with pytest.raises(tce.Interrupted, match="continues"):
-        tce.train(target, out=tmp_path / "stopped", progress=press, **call)
+    # A shell has its background jobs ignore the signal.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(tce.Interrupted, match="continues"):
+            tce.train(target, out=tmp_path / "stopped", progress=press, **call)
+    finally:
+        signal.signal(signal.SIGINT, before)
     starts = []
     tce.train(target, out=tmp_path / "stopped", progress=lambda *told: starts.append(told[1:3]), **call)
     tce.train(target, out=tmp_path / "whole", **call)
@@ -221,6 +227,6 @@ def test_results_show_themselves(source, target, wider):
     run = tce.train(target, wider, config=TINY)
     assert len(wider.plot().collections) == 3
     assert run.plot().lines
-    assert run.verdict["reason"] in run._repr_html_() and "imagined return" in run._repr_html_()
+    assert html.escape(run.verdict["reason"]) in run._repr_html_() and "imagined return" in run._repr_html_()
     pytest.importorskip("pandas")
     assert list(run.to_frame()["baseline"]) == [True, False]
