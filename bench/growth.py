@@ -4,7 +4,7 @@
 Made-up data of a stable linear system with noise (costs do not depend on what the numbers say), in files as a user has them. One thing grows
 at a time, from a base of 5 000 target rows, 1M source rows, 17 dimensions and 100 000 generated rows: target rows, source rows,
 dimensions, generated rows. Every call uses one core, and trains each network for 300 updates only, because updates cost the same whatever the number of rows;
-what is measured is the rest: wall time, time of each stage, and peak memory. Needs numpy and h5py, and `cargo build --release` before it."""
+what is measured is the rest: wall time, processor time and peak memory. Needs numpy and h5py, and `cargo build --release` before it."""
 import argparse
 import json
 import os
@@ -40,8 +40,7 @@ def write(path, rows, dims, pull, seed):
         for start in range(0, rows, 100_000):
             n = min(100_000, rows - start)
             s = rng.normal(0, 1, (n, dims)).astype(np.float32)
-            a = np.tanh(rng.normal(0, 1, (n, actions)) - s[:, :actions] if dims >= actions else rng.normal(0, 1, (n, actions)))
-            a = a.astype(np.float32)
+            a = np.tanh(rng.normal(0, 1, (n, actions)) - s[:, :actions]).astype(np.float32)
             s2 = (pull * s + a @ b + rng.normal(0, 0.05, (n, dims))).astype(np.float32)
             part = slice(start, start + n)
             sets["observations"][part], sets["actions"][part], sets["next_observations"][part] = s, a, s2

@@ -30,6 +30,11 @@ pub(crate) fn in_place() -> bool {
     *TERMINAL && !quiet()
 }
 
+/// The columns of the terminal on stderr, at least 40; None where stderr is none.
+pub fn columns() -> Option<usize> {
+    Term::stderr().size_checked().map(|(_, columns)| usize::from(columns).max(40))
+}
+
 /// Who gets the notes in place of stderr.
 type Listener = Box<dyn Fn(&str) + Send + Sync>;
 
@@ -46,8 +51,8 @@ pub fn say(text: &str) {
     if let Some(listener) = &*LISTENER.read().unwrap_or_else(PoisonError::into_inner) {
         return listener(text);
     }
-    let columns = Term::stderr().size_checked().map(|(_, columns)| usize::from(columns)).filter(|_| in_place());
-    let text = columns.map_or_else(|| text.to_owned(), |columns| crate::wrap::text(text, columns.max(40)));
+    let columns = if in_place() { columns() } else { None };
+    let text = columns.map_or_else(|| text.to_owned(), |columns| crate::wrap::text(text, columns));
     let print = || match text.strip_prefix("warning:") {
         Some(rest) => eprintln!("{}{rest}", style("warning:").for_stderr().yellow().bold()),
         None => eprintln!("{text}"),

@@ -65,33 +65,19 @@ struct Named<'a> {
 
 impl<'a> From<&'a Config> for Named<'a> {
     fn from(config: &'a Config) -> Self {
-        // Every field is named, so that a new one cannot be forgotten.
-        let Config {
-            target,
-            source,
-            generator,
-            filter,
-            labels,
-            dynamics,
-            fitted_q,
-            single_stage,
-            mixture,
-            learner,
-            evaluation,
-        } = config;
-        let fitted_q = (!fitted_q.is_default()).then_some(fitted_q);
+        // A field that is forgotten here is noticed by the test that holds this form against the keyed one.
         Self {
-            target,
-            source,
-            generator,
-            filter,
-            labels,
-            dynamics,
-            fitted_q,
-            single_stage,
-            mixture,
-            learner,
-            evaluation,
+            target: &config.target,
+            source: &config.source,
+            generator: &config.generator,
+            filter: &config.filter,
+            labels: &config.labels,
+            dynamics: &config.dynamics,
+            fitted_q: (!config.fitted_q.is_default()).then_some(&config.fitted_q),
+            single_stage: &config.single_stage,
+            mixture: &config.mixture,
+            learner: &config.learner,
+            evaluation: &config.evaluation,
         }
     }
 }

@@ -389,16 +389,17 @@ mod tests {
         let of = |preset, set: &[&str]| layered(preset, None, set).unwrap().config().unwrap().learner;
         let mut learner = of(Preset::Default, &[]);
         assert_eq!(learner.steps(LearnedRows::Mixed), 50_000);
-        assert_eq!(learner.fade(LearnedRows::Mixed), Some(30_000));
+        assert_eq!(learner.fade(), Some(30_000));
         learner.algorithm = Algorithm::Iql;
-        assert_eq!(learner.fade(LearnedRows::Mixed), None, "clones alone");
+        assert_eq!(learner.fade(), None, "clones alone");
         let mut short = of(Preset::Default, &["learner.bc.mixed_steps=15_000"]);
         assert_eq!((short.steps(LearnedRows::Target), short.steps(LearnedRows::Mixed)), (50_000, 15_000));
-        assert_eq!(short.fade(LearnedRows::Mixed), Some(9_000), "of the steps that are done");
+        let done = crate::config::LearnerConfig { steps: short.steps(LearnedRows::Mixed), ..short.clone() };
+        assert_eq!(done.fade(), Some(9_000), "of the steps that are done");
         short.steps = 300;
         assert_eq!(short.steps(LearnedRows::Mixed), 300, "it is no more than was asked for");
         let paper = of(Preset::Paper, &["learner.algorithm=bc"]);
-        assert_eq!((paper.steps(LearnedRows::Mixed), paper.fade(LearnedRows::Mixed)), (paper.steps, None));
+        assert_eq!((paper.steps(LearnedRows::Mixed), paper.fade()), (paper.steps, None));
     }
 
     #[test]

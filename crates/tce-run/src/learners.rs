@@ -161,9 +161,9 @@ impl LearnerConfig {
         self.own().steps(self.steps, rows)
     }
 
-    /// The step from which on only target rows are learned from; None: other rows are, to the end.
-    pub fn fade(&self, rows: LearnedRows) -> Option<u64> {
-        self.own().fade(self.steps(rows))
+    /// The step, of `steps`, from which on only target rows are learned from; None: other rows are, to the end.
+    pub fn fade(&self) -> Option<u64> {
+        self.own().fade(self.steps)
     }
 
     /// Rows of each update.

@@ -168,8 +168,7 @@ fn job(
     device: &Device,
 ) -> Result<(Buffer, Box<dyn PolicyLearner>)> {
     let members = data.iter().map(|d| member(d, config)).collect::<Result<Vec<_>>>()?;
-    let rows = LearnedRows::with(data.iter().find_map(|d| d.extra.as_ref()));
-    let buffer = Buffer::new(members, config.batch())?.fading(config.fade(rows));
+    let buffer = Buffer::new(members, config.batch())?.fading(config.fade());
     let learner = build(&buffer, config, place, device)?;
     Ok((buffer, learner))
 }

@@ -235,7 +235,7 @@ fn members(seeds: u64) -> Vec<Member> {
     (0..seeds).map(member).collect()
 }
 
-/// Ten steps a call of learners side by side, as [`tce_run::learning`] trains them.
+/// Ten steps a call of learners side by side, as [`tce_run::policy_training`] trains them.
 fn training<L: Learner + ?Sized + 'static>(device: &Device, jobs: Vec<(Buffer, Box<L>)>, flops: f64) -> Body {
     let (device, seeds) = (device.clone(), jobs.iter().map(|(buffer, _)| buffer.members().len()).sum::<usize>());
     let (buffers, mut learners): (Vec<_>, Vec<Box<L>>) = jobs.into_iter().unzip();
@@ -261,7 +261,7 @@ fn row_products(widths: &[usize]) -> (f64, f64) {
     (all as f64, (widths[0] * widths[1]) as f64)
 }
 
-/// The seeds as [`tce_run::learning`] trains them: side by side on the CPU, elsewhere as one set of tensors.
+/// The seeds as [`tce_run::policy_training`] trains them: side by side on the CPU, elsewhere as one set of tensors.
 fn jobs<L>(on: &On, seeds: u64, job: impl Fn(Vec<Member>) -> (Buffer, L)) -> Vec<(Buffer, L)> {
     let all = members(seeds);
     let size = if is_cpu(&on.device) { 1 } else { all.len() };

@@ -20,11 +20,15 @@ pub struct Rates {
     known: BTreeMap<String, f64>,
 }
 
+/// What is measured, a second of one core.
+fn of_a_core(measured: &Measured) -> f64 {
+    measured.per_second / rayon::current_num_threads() as f64
+}
+
 impl Rates {
     /// Rates of the CPU. What `measured` does not hold is measured when it is asked for.
     pub fn new(measured: &[Measured]) -> Self {
-        let threads = rayon::current_num_threads() as f64;
-        let known = measured.iter().map(|m| (m.name.clone(), m.per_second / threads)).collect();
+        let known = measured.iter().map(|m| (m.name.clone(), of_a_core(m))).collect();
         Self { on: On { device: tce_nn::cpu(), seeds: 1 }, known }
     }
 
@@ -36,8 +40,7 @@ impl Rates {
         let before = tce_base::set_quiet(true);
         let measured = measure(name, 1, SECONDS, &self.on);
         tce_base::set_quiet(before);
-        let measured = measured?;
-        let rate = measured.per_second / rayon::current_num_threads() as f64;
+        let rate = of_a_core(&measured?);
         self.known.insert(name.to_owned(), rate);
         Ok(units / rate)
     }

@@ -3,7 +3,8 @@
 
 use std::error::Error;
 
-use console::{Term, style};
+use console::style;
+use tce_base::terminal::columns;
 
 use crate::output::break_line;
 
@@ -12,15 +13,17 @@ const INDENT: &str = "    ";
 
 /// The text for `error`: wrapped and red on a terminal, plain elsewhere, so that logs can be searched.
 pub fn told(error: &dyn Error) -> String {
-    let width = Term::stderr().size_checked().map_or(usize::MAX, |(_, columns)| usize::from(columns).max(40));
-    laid_out(error, width).replacen('×', &style('×').for_stderr().red().to_string(), 1)
+    laid_out(error, columns().unwrap_or(usize::MAX)).replacen('×', &style('×').for_stderr().red().to_string(), 1)
 }
 
 /// The text of clap for a wrong call, wrapped on a terminal: clap wraps its help, but not its errors.
 pub fn wrong_call(error: &clap::Error) -> String {
     let styled = error.render();
     let text = if console::colors_enabled_stderr() { styled.ansi().to_string() } else { styled.to_string() };
-    Term::stderr().size_checked().map_or(text.clone(), |(_, columns)| wrapped(&text, usize::from(columns).max(40)))
+    match columns() {
+        Some(columns) => wrapped(&text, columns),
+        None => text,
+    }
 }
 
 /// Every line of `text` in at most `width` columns; further lines stand as deep as their first.

@@ -28,9 +28,9 @@
 //! alone. HalfCheetah, kinematic, ensembles of five, 50k steps: 49.5 points without generated rows, 51.6 with half a
 //! batch of them to the end, 73.3 with `fade` = .6 (bench/expansion.md).
 //!
-//! Without `fade`, clones of target and generated rows need shorter training than clones of the target rows alone and then get worse
-//! again: HalfCheetah, ensembles of five, 73, 77, 68 points after 8k, 15k, 30k steps; Walker2d 70, 93, 92
-//! (bench/expansion.md). The caller gets the number of steps from [`BcConfig::steps`].
+//! Without `fade`, clones of target and generated rows need shorter training than clones of the target rows alone and
+//! then get worse again: HalfCheetah, ensembles of five, 73, 77, 68 points after 8k, 15k, 30k steps; Walker2d 70, 93,
+//! 92 (bench/expansion.md). The caller gets the number of steps from [`BcConfig::steps`].
 //!
 //! Raw or standardised observations, and all rows or the best trajectories, are properties of a member's data. One
 //! population may contain all of them.
@@ -110,7 +110,7 @@ pub struct BcConfig {
     #[schemars(range(min = 1, max = 64))]
     pub ensemble: usize,
     /// Share of hidden units that are left out of each update, at random.
-    #[serde(skip_serializing_if = "no_dropout")]
+    #[serde(skip_serializing_if = "is_zero")]
     #[schemars(range(min = 0.0, max = 0.9))]
     pub dropout: f64,
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
@@ -118,7 +118,7 @@ pub struct BcConfig {
     pub mixed_steps: u64,
     /// Share of the steps after which only target rows are cloned. The other rows' share of a batch falls linearly until then. 0: half of
     /// every batch, to the end.
-    #[serde(skip_serializing_if = "no_fade")]
+    #[serde(skip_serializing_if = "is_zero")]
     #[schemars(range(min = 0.0, max = 1.0))]
     pub fade: f64,
     /// Rows of each update. 0: `learner.batch`.
@@ -143,19 +143,9 @@ impl Default for BcConfig {
     }
 }
 
-// The cache keys of runs from before this key was added do not contain it.
-fn is_zero(batch: &usize) -> bool {
-    *batch == 0
-}
-
-// The cache keys of runs from before this key was added do not contain it.
-fn no_fade(share: &f64) -> bool {
-    *share == 0.0
-}
-
-// The cache keys of runs from before dropout was added do not contain it.
-fn no_dropout(rate: &f64) -> bool {
-    *rate == 0.0
+// The cache keys of runs from before a key was added do not contain it.
+fn is_zero<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 /// β of [`Actor::likelihood_loss`], as its authors recommend it.

@@ -180,7 +180,10 @@ impl Buffer {
     /// Rows of each of `parts` in the batch of `step`.
     fn split(&self, step: u64, parts: &[Arc<Transitions>]) -> Vec<usize> {
         let rows = split(self.batch, parts);
-        self.fade.map_or(rows.clone(), |until| faded(rows, step, until))
+        match self.fade {
+            Some(until) => faded(rows, step, until),
+            None => rows,
+        }
     }
 
     /// An empty buffer of one member that grows by [`Buffer::replay_mut`]: the replay buffer of an agent. Observations
