@@ -134,8 +134,13 @@ pub fn begin_step(name: &str) {
     };
     remember(keep);
     let mut headline = HEADLINE.lock().unwrap_or_else(PoisonError::into_inner);
-    if line && headline.is_none() {
-        *headline = Some(Headline::drawn_by(|| course().as_ref().map_or_else(String::new, |c| c.line(Instant::now()))));
+    match &*headline {
+        Some(headline) => headline.draw(),
+        None if line => {
+            let text = || course().as_ref().map_or_else(String::new, |c| c.line(Instant::now()));
+            *headline = Some(Headline::drawn_by(text));
+        }
+        None => {}
     }
 }
 
@@ -191,6 +196,13 @@ impl Headline {
             bar.enable_steady_tick(Duration::from_millis(500));
             bar
         }))
+    }
+
+    /// Draws the line now. A step may be over before the next tick, and indicatif skips drawings that follow each other closely.
+    fn draw(&self) {
+        if let Some(bar) = &self.0 {
+            bar.force_draw();
+        }
     }
 }
 
