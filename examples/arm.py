@@ -1,14 +1,15 @@
-"""A two-link arm in the plane whose hand carries a weight: a robot of one's own, in a page of NumPy and gymnasium.
+"""A two-link arm in the plane whose hand carries a weight: a robot of one's own, in a page of NumPy.
 
 State (8): cos and sin of both joint angles, both joint velocities (rad/s), and the goal's position (m). Action (2): joint torques in
 [-1, 1], in units of `TORQUE` Nm. Reward: minus the hand's distance to the goal (m), minus a little for torque. 60 steps of 0.05 s.
+
+`reset` and `step` are called as gymnasium's; `arm_env.py` makes it a `gymnasium.Env`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
 
@@ -20,24 +21,24 @@ STEPS = 60
 FRICTION = 1.0  # Nm s
 
 
-class Arm(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class Arm:
     """`load` is the weight in the hand, in kg: the changed robot carries more."""
 
     def __init__(self, load: float = 0.2) -> None:
         self.load = load
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (8,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._random = np.random.default_rng()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.angles = self.np_random.uniform([-np.pi, -2.5], [np.pi, 2.5])
-        self.velocities = self.np_random.normal(0.0, 0.1, 2)
-        radius, direction = self.np_random.uniform(0.3, 0.9), self.np_random.uniform(-np.pi, np.pi)
+    def reset(self, *, seed: int | None = None) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        if seed is not None:
+            self._random = np.random.default_rng(seed)
+        self.angles = self._random.uniform([-np.pi, -2.5], [np.pi, 2.5])
+        self.velocities = self._random.normal(0.0, 0.1, 2)
+        radius, direction = self._random.uniform(0.3, 0.9), self._random.uniform(-np.pi, np.pi)
         self.goal = radius * np.array([np.cos(direction), np.sin(direction)])
         self.steps = 0
         return self._observation(), {}
 
-    def step(self, action: npt.NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: npt.ArrayLike) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         torque = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
         for _ in range(5):
             self.velocities += STEP / 5 * self._acceleration(torque * TORQUE)

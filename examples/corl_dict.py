@@ -1,6 +1,6 @@
 """TCE's rows as D4RL's dict, as CORL's scripts take it, and behaviour cloning on it in plain PyTorch. About a quarter of an hour on two cores.
 
-    pip install . torch gymnasium
+    pip install . torch
     python examples/corl_dict.py
 """
 

@@ -1,6 +1,6 @@
 """TCE's rows for a learner of d3rlpy: target and generated transitions of the arm, IQL of d3rlpy. About a quarter of an hour on two cores.
 
-    pip install . d3rlpy gymnasium
+    pip install . d3rlpy
     python examples/d3rlpy_iql.py
 """
 

@@ -86,7 +86,7 @@ def evaluate(
     policy : Policy, or a function from an observation to an action
         Functions are called with single observations, shape (d_s,).
     env : str, gymnasium.Env or gymnasium.vector.VectorEnv
-        A domain of the benchmark by its name, which the program runs itself, or any environment.
+        A domain of the benchmark by its name, which the program runs itself, or any object with gymnasium's ``reset`` and ``step``.
     episodes : int
         How many.
     seed : int

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import tce
@@ -53,6 +57,7 @@ def test_the_program_and_gymnasium_agree():
 
 def test_vector_environments_count_whole_episodes():
     import arm
+    from arm_env import ArmEnv
 
     def policy(observation):
         return np.clip(-0.3 * observation[4:6], -1, 1)
@@ -63,7 +68,7 @@ def test_vector_environments_count_whole_episodes():
     modes = [m for m in getattr(gymnasium.vector, "AutoresetMode", [None]) if m is None or m.name != "DISABLED"]
     for mode in modes:
         options = {} if mode is None else {"autoreset_mode": mode}
-        lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 3, **options)
+        lanes = gymnasium.vector.SyncVectorEnv([ArmEnv] * 3, **options)
         found = tce.evaluate(policy, lanes, episodes=6, seed=0)
         assert list(found.lengths) == [arm.STEPS] * 6, mode
         assert abs(found.mean - single.mean) < 25, (mode, found, single)
@@ -71,13 +76,26 @@ def test_vector_environments_count_whole_episodes():
 
 def test_a_trained_policy_in_an_own_environment():
     import arm
+    from arm_env import ArmEnv
     from conftest import TINY
 
     data = tce.load(arm.log(load=0.2, episodes=4, skill=1.0, seed=0), step_limit=arm.STEPS)
     policy = tce.train(data, config=TINY, compare=False).policy
-    lanes = gymnasium.vector.SyncVectorEnv([arm.Arm] * 2)
+    lanes = gymnasium.vector.SyncVectorEnv([ArmEnv] * 2)
     assert len(tce.evaluate(policy, lanes, episodes=4).returns) == 4
     assert len(tce.evaluate(policy, arm.Arm(), episodes=2).returns) == 2
+
+
+def test_the_first_example_needs_the_package_alone():
+    import arm
+    import conftest
+
+    blocked = "import sys; sys.modules.update(gymnasium=None, matplotlib=None, mujoco=None)\n"
+    code = "import arm, own_robot, tce\nprint(tce.evaluate(lambda o: [0.0, 0.0], arm.Arm(), episodes=2, seed=3).returns.tolist())"
+    found = subprocess.run([sys.executable, "-c", blocked + code], cwd=conftest.ROOT / "examples", capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    here = tce.evaluate(lambda o: [0.0, 0.0], arm.Arm(), episodes=2, seed=3).returns.tolist()
+    assert json.loads(found.stdout) == here
 
 
 def test_wrong_calls():
