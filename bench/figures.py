@@ -1,9 +1,13 @@
 #!/usr/bin/env python3
-"""Draws docs/images/results.svg from the records in bench/results: our policies, and the paper's TCE(OG) and best other method.
+"""Draws the figures of the README and of the pages in bench/.
 
     pip install matplotlib && python3 bench/figures.py
+
+Scores come from the records in bench/results. The other figures are drawn from the tables of their own pages, so that a figure and its
+table cannot differ.
 """
 import json
+import re
 from collections import defaultdict
 from pathlib import Path
 
@@ -16,19 +20,28 @@ HERE = Path(__file__).resolve().parent
 PAPER = HERE.parent / "crates/tce-report/paper"
 AGENTS = {"halfcheetah": "HalfCheetah", "hopper": "Hopper", "walker2d": "Walker2d", "ant": "Ant"}
 SHIFTS = ["morph", "kinematic", "gravity"]
-OURS = [("bc-ensemble", "five clones of the target rows, ours", "#3d6b94"), ("tce-og", "with generated rows, ours", "#d9772b")]
+OURS = [("bc-ensemble", "five clones of the target rows, ours", "#3d6b94"), ("tce-og", "TCE(OG), ours", "#d9772b")]
+# How a method is called in records from before it was the default.
+SAME = {"tce-og (fade)": "tce-og"}
 THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", "#dfe2e7")]
+BLUE, ORANGE, GREEN, GREY = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c"
+
+
+def runs():
+    """All runs of all records, as (record, run)."""
+    for path in sorted((HERE / "results").glob("*.jsonl")):
+        for line in map(json.loads, path.read_text().splitlines()):
+            if run := line.get("run"):
+                yield path.stem, run
 
 
 def scores():
-    """Scores of single runs by task and method, of columns with a preset's own settings."""
+    """Scores of single runs by task and method, of columns with a preset's own settings. Of two records of a seed the later file counts."""
     found = defaultdict(dict)
-    for path in sorted((HERE / "results").glob("*.jsonl")):
-        for line in map(json.loads, path.read_text().splitlines()):
-            run = line.get("run")
-            if run and run["recipe"]["preset"] == "default":
-                for member in run["folder"]["members"]:
-                    found[run["task"], run["method"]][member["seed"]] = member["verdict"]["score"]
+    for _, run in runs():
+        if run["recipe"]["preset"] == "default":
+            for member in run["folder"]["members"]:
+                found[run["task"], SAME.get(run["method"], run["method"])][member["seed"]] = member["verdict"]["score"]
     return {key: [seeds[k] for k in sorted(seeds)] for key, seeds in found.items()}
 
 
@@ -42,11 +55,48 @@ def paper(shift, agent):
     return {"TCE(OG)": values["TCE(OG)"], "best": max(others)}
 
 
-def main():
+def tables(page):
+    """The tables of a page: its heading, and a dict of texts for every row."""
+    found, heading, header = [], "", None
+    for line in (HERE / page).read_text().splitlines():
+        if line.startswith("#"):
+            heading = line.lstrip("# ")
+        if not line.startswith("|"):
+            header = None
+            continue
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if header is None:
+            header = cells
+            found.append((heading, []))
+        elif not set(line) <= set("|-: "):
+            found[-1][1].append(dict(zip(header, cells)))
+    return found
+
+
+def number(text):
+    """The first number of a cell."""
+    match = re.search(r"-?\d*\.?\d+(e-?\d+)?", text)
+    return float(match[0]) if match else None
+
+
+def panels(rows, columns, size, **options):
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, **options)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, list(axes.flat)
+
+
+def save(figure, path):
+    figure.tight_layout()
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
+def results():
+    """The README's: ours and the paper's, on twelve tasks."""
     ours = scores()
-    series = [s for s in OURS if any(method == s[0] for _, method in ours)] + THEIRS
-    plt.rcParams.update({"font.size": 9, "svg.hashsalt": "tce", "svg.fonttype": "none"})
-    figure, axes = plt.subplots(len(SHIFTS), 1, figsize=(8, 7.2), sharey=True)
+    series = OURS + THEIRS
+    figure, axes = panels(len(SHIFTS), 1, (8, 7.2), sharey=True)
     for axis, shift in zip(axes, SHIFTS):
         for k, (key, label, colour) in enumerate(series):
             for place, agent in enumerate(AGENTS):
@@ -62,12 +112,115 @@ def main():
         axis.set_ylim(0, 139)
         axis.set_yticks([0, 25, 50, 75, 100])
         axis.set_title(shift, loc="left", fontsize=10, fontweight="bold")
-        axis.spines[["top", "right"]].set_visible(False)
     axes[0].legend(ncols=2, frameon=False, loc="lower right", bbox_to_anchor=(1, 1.02), fontsize=8)
     axes[1].set_ylabel("normalised score")
-    figure.tight_layout()
-    out = HERE.parent / "docs/images/results.svg"
-    figure.savefig(out, metadata={"Date": None})
+    save(figure, HERE.parent / "docs/images/results.svg")
+
+
+def prior_methods():
+    """Scores of single runs of every method, robot by robot."""
+    order = ["bc", "target-only", "dara", "srpo", "igdf", "bosa", "otdf", "dmc", "meta-dt", "synther", "rebrac", "td3-bc"]
+    found = defaultdict(list)
+    for record, run in runs():
+        method = run["method"].replace(" 2026-11 gpu", "").replace(" 2026-11", "")
+        if record.endswith("prior-methods") and method in order:
+            found[run["task"].split("-")[0], method] += [m["verdict"]["score"] for m in run["folder"]["members"]]
+    figure, axes = panels(1, len(AGENTS), (9, 3.9), sharey=True)
+    for axis, (agent, name) in zip(axes, AGENTS.items()):
+        for place, method in enumerate(order):
+            values = found[agent, method]
+            axis.plot(values, [place] * len(values), "o", color=BLUE if method in order[:2] else ORANGE, markersize=4, alpha=0.7)
+        axis.set_title(name, fontsize=10)
+        axis.set_xlim(-3, 106)
+        axis.set_xticks([0, 50, 100])
+        axis.grid(axis="y", color="#eee")
+        axis.set_axisbelow(True)
+    axes[0].set_yticks(range(len(order)), order)
+    axes[0].invert_yaxis()
+    figure.supxlabel("normalised score of single runs; blue: the target's rows alone", fontsize=9)
+    save(figure, HERE / "prior-methods.svg")
+
+
+def evidence():
+    """Mean and standard deviation over seeds, beside the paper's TCE(OG)."""
+    rows = tables("evidence.md")[0][1][:4]
+    methods = [(name, colour) for name, colour in zip(list(rows[0])[1:6], ["#dfe2e7", BLUE, ORANGE, GREEN, GREY])]
+    figure, (axis,) = panels(1, 1, (8, 3.2))
+    for k, (method, colour) in enumerate(methods):
+        for place, row in enumerate(rows):
+            mean, deviation = (number(part) for part in row[method].split("±"))
+            axis.bar(place + (k - 2) * 0.16, mean, 0.14, yerr=deviation, color=colour, error_kw={"elinewidth": 0.8}, label=method if place == 0 else None)
+    for place, row in enumerate(rows):
+        theirs = number(list(row.values())[6])
+        axis.plot([place - 0.4, place + 0.4], [theirs] * 2, "k:", linewidth=1, label="TCE(OG), the paper's figure" if place == 0 else None)
+    axis.set_xticks(range(len(rows)), [row["task"] for row in rows])
+    axis.set_ylabel("normalised score")
+    axis.set_ylim(0, 112)
+    axis.legend(ncols=3, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=8)
+    save(figure, HERE / "evidence.svg")
+
+
+def generator():
+    """Consistency with the simulator against the cost of a sample, for samplers of EDM."""
+    found = [(heading, rows) for heading, rows in tables("generator.md") if rows and "sampler" in rows[0] and "process" not in rows[0]][:2]
+    colours = {"PC": GREY, "Heun": GREEN, "DPM++": BLUE, "SDE-DPM++": ORANGE}
+    figure, axes = panels(1, 2, (8, 3.1))
+    for axis, (heading, rows) in zip(axes, found):
+        for family, colour in colours.items():
+            own = [row for row in rows if re.split(r"[-(]\d", row["sampler"])[0] == family]
+            points = sorted((number(row["NFE"]), number(row["consistency ŷ = 0"])) for row in own)
+            axis.plot(*zip(*points), "o-", color=colour, markersize=4, linewidth=1, label=family)
+        axis.set_xscale("log")
+        axis.set_xticks([5, 10, 20, 50, 1000], [5, 10, 20, 50, 1000], minor=False)
+        axis.minorticks_off()
+        axis.set_ylim(0)
+        axis.set_title(heading.split(":")[0], fontsize=10)
+        axis.set_xlabel("evaluations a sample")
+    axes[0].set_ylabel("median error of s', in steps")
+    axes[1].legend(frameon=False, fontsize=8)
+    save(figure, HERE / "generator.svg")
+
+
+def replay():
+    """Errors of single simulated steps, file by file."""
+    rows = tables("replay.md")[0][1]
+    figure, (axis,) = panels(1, 1, (8, 4.6))
+    for column, colour, mark in (("s' median", BLUE, "o"), ("s' p99", ORANGE, "o"), ("s' max", GREY, "x")):
+        axis.plot([number(row[column]) for row in rows], range(len(rows)), mark, color=colour, markersize=4, label=column)
+    for bar, colour in ((1e-6, BLUE), (1e-4, ORANGE)):
+        axis.axvline(bar, color=colour, linewidth=0.8, linestyle=":")
+    axis.set_xscale("log")
+    axis.set_yticks(range(len(rows)), [row["file"] for row in rows], fontsize=7)
+    axis.invert_yaxis()
+    axis.set_xlabel("largest absolute error over the components of s' (dotted: the bars)")
+    axis.legend(frameon=False, fontsize=8)
+    save(figure, HERE / "replay.svg")
+
+
+def oldest_scores():
+    """Scores of single seeds by method, task by task."""
+    found = [(heading, rows) for heading, rows in tables("scores.md") if rows and "seeds" in rows[0] and heading.endswith("to-expert")]
+    methods = list(dict.fromkeys(row["method"] for _, rows in found for row in rows))
+    figure, axes = panels(1, len(found), (9, 3.1), sharey=True)
+    for axis, (heading, rows) in zip(axes, found):
+        for row in rows:
+            values = [number(cell) for cell in row["seeds"].split(",")]
+            place = methods.index(row["method"])
+            axis.plot(values, [place] * len(values), "o", color=ORANGE if "TCE" in row["method"] else BLUE, markersize=4, alpha=0.7)
+        axis.set_title(heading.split("_")[0], fontsize=9)
+        axis.set_xlim(-3, 106)
+        axis.grid(axis="y", color="#eee")
+        axis.set_axisbelow(True)
+    axes[0].set_yticks(range(len(methods)), methods, fontsize=8)
+    axes[0].invert_yaxis()
+    figure.supxlabel("normalised score of single seeds, medium source, expert target", fontsize=9)
+    save(figure, HERE / "scores.svg")
+
+
+def main():
+    plt.rcParams.update({"font.size": 9, "svg.hashsalt": "tce", "svg.fonttype": "none"})
+    for draw in (results, prior_methods, evidence, generator, replay, oldest_scores):
+        draw()
 
 
 if __name__ == "__main__":

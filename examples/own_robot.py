@@ -1,6 +1,6 @@
 """A robot of one's own: many rows of the old arm, few of the changed one, a policy for the changed one.
 
-About an hour on two cores; with --quick about a quarter of an hour (18 minutes of processor time).
+About an hour on two cores; with --quick about a quarter of an hour (12 minutes of processor time).
 
 The hand of the arm (arm.py) carries 0.2 kg; then it carries 1.5 kg. 40 logged episodes of the changed arm are all there is.
 

@@ -57,7 +57,7 @@ class Evaluation:
 
 
 def make(name: str, render_mode: str | None = None) -> Any:
-    """A robot of the benchmark as a ``gymnasium.Env``. Needs ``gymnasium`` and MuJoCo (``pip install 'tce[sim]'``).
+    """A robot of the benchmark as a ``gymnasium.Env``. Needs ``gymnasium`` and MuJoCo (``pip install '.[sim]'`` in a clone).
 
     Parameters
     ----------

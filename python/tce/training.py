@@ -117,7 +117,8 @@ def train(
     target : see :func:`tce.load`
         The rows to learn from.
     extra : see :func:`tce.load`, or Augmented, optional
-        Further rows: generated ones (what :func:`tce.augment` returned), or the source's. Half of every batch comes from them.
+        Further rows: generated ones (what :func:`tce.augment` returned), or the source's. At first half of every batch comes
+        from them; for clones this share falls to nothing (`learner.bc.fade`).
     source : see :func:`tce.load`, optional
         The old robot's rows: the learned dynamics, in which policies are compared, are better with them. Taken from `extra` if that is
         :class:`Augmented`.

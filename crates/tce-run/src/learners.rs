@@ -33,7 +33,8 @@ macro_rules! learners {
             pub algorithm: Algorithm,
             /// Training steps of the policy.
             pub steps: u64,
-            /// Rows per step. With other rows half of them are the target's; else all are. Source: Table C.4.
+            /// Rows per step; `bc` has its own, `learner.bc.batch`. With other rows half of them are the target's, except where `learner.bc.fade`
+            /// lowers the others' share. Source: Table C.4.
             #[schemars(range(min = 1))]
             pub batch: usize,
             /// Whether observations are standardised.

@@ -127,7 +127,11 @@ impl TrainingRun<'_> {
             Comparison::Skip => None,
             Comparison::Recommend => {
                 let alone_is_baseline = inputs.extra.is_none();
-                let own = Candidate { name: method.name.into(), baseline: alone_is_baseline, files: policies.clone() };
+                let name = match alone_is_baseline {
+                    true => method.name.to_owned(),
+                    false => format!("{} with the extra rows", method.name),
+                };
+                let own = Candidate { name, baseline: alone_is_baseline, files: policies.clone() };
                 let baseline = (!alone_is_baseline).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
                 Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
             }
@@ -234,7 +238,7 @@ fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
         None => summary.is_none(),
     };
     if !same {
-        let end = if summary.is_some() { "the results of" } else { "an interrupted" };
+        let end = if summary.is_some() { "the results of a" } else { "an interrupted" };
         return Err(Error::Usage(format!(
             "{}: found {end} training run with other settings, seeds or files; choose another --out{}",
             out.display(),

@@ -65,7 +65,7 @@ pub struct Tried {
     /// asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fitted_q: Option<[f64; 2]>,
-    /// Imagined return less that of the standard, and its standard error.
+    /// Supported return less that of the standard, and its standard error.
     pub over_standard: [f64; 2],
 }
 
@@ -74,7 +74,7 @@ pub struct Tried {
 pub struct Verdict {
     /// The method.
     pub method: String,
-    /// Its policy with the highest imagined return.
+    /// Its policy with the highest supported return.
     pub policy: PathBuf,
     /// Whether the difference that decided is more than [`SURE`] standard errors.
     pub sure: bool,
@@ -103,6 +103,16 @@ fn mean_and_error(values: &[f64]) -> [f64; 2] {
 /// Mean and standard error of the paired differences.
 fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
     mean_and_error(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>())
+}
+
+/// Decimals with which a number of this standard error is written: returns may be thousands or hundredths.
+fn decimals(error: f64) -> usize {
+    match error {
+        e if e == 0.0 || e >= 2.0 => 0,
+        e if e >= 0.2 => 1,
+        e if e >= 0.02 => 2,
+        _ => 3,
+    }
 }
 
 /// The verdict where there is no choice: one candidate with one policy.
@@ -179,22 +189,28 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
     let next_best = best(&|k| k != chosen);
     let gap = next_best.map(|k| difference(&returns[chosen], &returns[k]));
     let name = |k: usize| &candidates[k].name;
+    let digits = gap.map_or(0, |[_, error]| decimals(error));
     let reason = match (next_best, gap) {
         (Some(k), Some([by, error])) if chosen != standard => {
             format!(
-                "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.0}, {} {:.0} (difference from the next best {by:.0} ± {error:.0}).",
+                "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.digits$}, {} {:.digits$} (difference from the next best {by:.digits$} ± {error:.digits$}).",
                 name(chosen),
                 mean(chosen),
                 name(standard),
                 mean(standard),
             ) + if k == standard { "" } else { " The next best is not a baseline." }
         }
-        (Some(k), Some([by, error])) => format!(
-            "{} is recommended: tried in learned dynamics, near the target's states, no method returns clearly more ({} {by:+.0} ± {error:.0} against {}).",
-            name(chosen),
-            if by >= 0.0 { "it is ahead by" } else { "it is behind by" },
-            name(k),
-        ),
+        (Some(k), Some([by, error])) => {
+            let next = name(k);
+            let told = match by >= 0.0 {
+                true => format!("the next best, {next}, {by:.digits$} ± {error:.digits$} less"),
+                false => format!("{next} {:.digits$} ± {error:.digits$} more, which is too little to go by", -by),
+            };
+            format!(
+                "{} is recommended: tried in learned dynamics, near the target's states, no method returns clearly more ({told}).",
+                name(chosen)
+            )
+        }
         _ => format!("{} is the only method there is.", name(chosen)),
     };
     let seed = (0..estimates[chosen].len())
@@ -293,9 +309,14 @@ mod tests {
         let ahead = choose([&[150.0, 250.0, 350.0, 450.0], &[150.0, 250.0, 350.0, 452.0]]);
         assert_eq!((ahead.method.as_str(), ahead.policy.to_str(), ahead.sure), ("method", Some("method-1"), true));
         assert_eq!(ahead.tried[1].over_standard[0], 50.0);
+        assert!(ahead.reason.contains("(difference from the next best 50 ± 0)"), "{}", ahead.reason);
+        assert_eq!([30.0, 0.7, 0.05, 0.001].map(decimals), [0, 1, 2, 3]);
         // As much on average, from one episode: chance.
         let lucky = choose([&[100.0, 200.0, 300.0, 600.0], &[100.0, 200.0, 300.0, 600.0]]);
         assert_eq!((lucky.method.as_str(), lucky.sure), ("baseline", false));
+        assert!(lucky.reason.ends_with("(method 50 ± 50 more, which is too little to go by)."), "{}", lucky.reason);
+        let behind = choose([&[50.0, 150.0, 250.0, 350.0], &[50.0, 150.0, 250.0, 352.0]]);
+        assert!(behind.reason.ends_with("(the next best, method, 50 ± 0 less)."), "{}", behind.reason);
         // Always more, but by nothing that matters.
         let slightly = choose([&[101.0, 201.0, 301.0, 402.0], &[101.0, 201.0, 301.0, 402.0]]);
         assert_eq!(slightly.method, "baseline");

@@ -48,7 +48,7 @@ use crate::training::{Learner, Meter};
 const ABOUT: About = About {
     name: "iql",
     title: "IQL",
-    description: "implicit Q-learning, TCE's learner",
+    description: "implicit Q-learning, the learner of TCE in its paper",
     reference: "Kostrikov et al. 2022; TCE, B.2",
     published: None,
     table: "iql",

@@ -10,13 +10,14 @@ use tce_run::error::{Error, Result};
 use tce_run::inputs::Inputs;
 use tce_run::off_policy_evaluation::{OffPolicyEstimate, OffPolicyEvaluator};
 use tce_run::own::Own;
+use tce_zoo::actors::read_policy;
 
 use crate::output::{Output, table};
 
 /// Arguments of `compare`.
 #[derive(Debug, Args)]
 pub struct CompareArgs {
-    /// The policies to compare.
+    /// The policies to compare: files, or zoo:NAME.
     #[arg(required = true, value_name = "POLICY")]
     policies: Vec<PathBuf>,
     /// Many transitions of the unchanged robot.
@@ -62,7 +63,7 @@ impl CompareArgs {
         let inputs = Inputs::of_files(self.source.as_deref(), &self.target, None, &self.own)?;
         let dims = (inputs.target.rows.obs_dim, inputs.target.rows.act_dim);
         let load = |path: &PathBuf| -> Result<Policy> {
-            let policy = Policy::load(path)?;
+            let policy = read_policy(path)?;
             if policy.dims() != dims {
                 return Err(Error::Usage(format!(
                     "{}: found a policy of {:?} observations and actions, expected {dims:?} as in {}; give a policy of this robot",

@@ -17,7 +17,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     (
         "",
         &[
-            ("the whole job, small, in minutes", "tce run 'hopper-morph:medium->expert' --preset quick"),
+            ("the whole job, small, in minutes", "tce run hopper-morph/medium/expert --preset quick"),
             ("what is in a file of your own", "tce data check new_robot.hdf5"),
             ("a policy from two files of your own", "tce augment --source old.hdf5 --target new.hdf5 --out wider.hdf5"),
             ("", "tce learn --target new.hdf5 --extra wider.hdf5 --source old.hdf5 --out policy/"),
@@ -26,13 +26,13 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     (
         "run",
         &[
-            ("a first look, in minutes", "tce run 'hopper-morph:medium->expert' --preset quick"),
-            ("a result: five seeds", "tce run 'ant-gravity:medium->expert' --seeds 5"),
+            ("a first look, in minutes", "tce run hopper-morph/medium/expert --preset quick"),
+            ("a result: five seeds", "tce run ant-gravity/medium/expert --seeds 5"),
             (
                 "two methods, without the simple ones",
-                "tce run 'hopper-morph:medium->expert' --variant tce-og,otdf --no-baselines",
+                "tce run hopper-morph/medium/expert --variant tce-og,otdf --no-baselines",
             ),
-            ("other settings", "tce run 'hopper-morph:medium->expert' --set generator.y_max=0.1"),
+            ("other settings", "tce run hopper-morph/medium/expert --set generator.y_max=0.1"),
         ],
     ),
     ("export", &[("a policy for ONNX runtimes", "tce export policy/policy.safetensors --onnx policy.onnx")]),
@@ -144,7 +144,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("one key, explained", "tce config show generator.y_max"),
             (
                 "the keys of the learner, for a method on a task",
-                "tce config show learner 'hopper-morph:medium->expert' --variant otdf",
+                "tce config show learner hopper-morph/medium/expert --variant otdf",
             ),
         ],
     ),
@@ -160,9 +160,9 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             (
                 "two samplers with every noise process",
-                "tce diagnose generator 'hopper-morph:medium->expert' --samplers dpm:20,heun:18",
+                "tce diagnose generator hopper-morph/medium/expert --samplers dpm:20,heun:18",
             ),
-            ("every network that the training kept", "tce diagnose generator 'hopper-morph:medium->expert' --cycles"),
+            ("every network that the training kept", "tce diagnose generator hopper-morph/medium/expert --cycles"),
         ],
     ),
     (

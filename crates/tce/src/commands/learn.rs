@@ -22,7 +22,7 @@ pub struct Learn {
     /// Print all learners: what they are, whose, and how their public code differs.
     #[arg(long)]
     list: bool,
-    /// The rows to learn from (HDF5). With --extra, half of every batch comes from here.
+    /// The rows to learn from (HDF5). With --extra a batch begins half target rows, half extra rows; clones end with target rows alone (learner.bc.fade).
     #[arg(long, value_name = "FILE", required_unless_present = "list")]
     target: Option<PathBuf>,
     /// Further rows: the source's, generated ones, or a mixture of both.
@@ -104,6 +104,10 @@ fn render(report: &Trained) -> String {
         }
     }
     if let Some(kept) = &report.verdict {
+        // A single policy is taken without being tried.
+        if kept.verdict.tried.is_empty() {
+            return text + "\n" + &kept.sentences();
+        }
         let rows = kept.verdict.tried.iter().map(|t| {
             [
                 if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
@@ -118,11 +122,12 @@ fn render(report: &Trained) -> String {
             let name = "the target's logged episodes".to_owned();
             [name, "-".into(), "-".into(), "-".into(), format!("{value:.1}"), "0".into()]
         });
-        let header = ["policy", "imagined return", "supported", "of an episode survived", "fitted Q", "action error"];
+        let header = ["policy", "imagined return", "supported", "survival", "fitted Q", "action error"];
         text += &format!(
             "\nEstimated without a simulator (± standard error):\n{}\n\
              imagined return: of episodes in learned dynamics of the robot\n\
-             supported: as much of it as is near the target's states; it decides\n\
+             supported: the imagined return until the episode is far from every target state; it decides\n\
+             survival: share of a whole episode's steps that the policy reached there\n\
              fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
              action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n\n{}",
             table(&header, rows.chain(logged)),

@@ -35,8 +35,8 @@ pub struct Run {
     seed: u64,
     #[command(flatten)]
     data: DataArgs,
-    /// Leave out the baselines (cloning with raw and with standardised observations, cloning of the best half, IQL on the target
-    /// alone).
+    /// Leave out the baselines (cloning with raw and with standardised observations, of the best half, by an ensemble of five; IQL on
+    /// the target alone).
     #[arg(long, alias = "no-floors", help_heading = "What stands beside it")]
     no_baselines: bool,
     /// Do not try the policies in learned dynamics, and recommend none.

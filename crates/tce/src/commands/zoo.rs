@@ -151,7 +151,7 @@ fn show(s: &Shown) -> String {
     let c = &s.card;
     let began = c.from.clone().unwrap_or_else(|| "new networks".into());
     let rows = [
-        ("robot, domain", format!("{}, {}", c.agent, c.shift)),
+        ("robot", format!("{}, {}", c.agent, c.shift)),
         ("role", c.role.clone().unwrap_or_default()),
         ("return", format!("{:.1} ± {:.1} over {} episodes with sampled actions", c.mean, c.std, c.episodes)),
         ("length", format!("{:.1}", c.length)),
@@ -159,10 +159,11 @@ fn show(s: &Shown) -> String {
         ("training", training(c)),
         ("began with", began),
         ("trained by", c.program.clone()),
-        ("file", format!("{} bytes, SHA-256 {}", s.bytes, s.sha256)),
+        ("file", format!("{} bytes", s.bytes)),
+        ("SHA-256", s.sha256.clone()),
         ("use it as", format!("zoo:{}", s.name)),
     ];
-    rows.iter().fold(format!("{}\n", s.name), |text, (name, value)| text + &format!("  {name:<14} {value}\n"))
+    rows.iter().fold(format!("{}\n", s.name), |text, (name, value)| text + &format!("  {name:<12} {value}\n"))
 }
 
 fn training(c: &Card) -> String {

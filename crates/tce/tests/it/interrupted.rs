@@ -141,7 +141,7 @@ fn kill_loop(directory: &Path, args: &[&str], out: &str, kills: usize, seed: u64
     ends + 1
 }
 
-/// How many kills: `TCE_KILLS`, for the longer loop of the README.
+/// How many kills: `TCE_KILLS`, for the longer loop of CONTRIBUTING.md.
 fn kills(usual: usize) -> usize {
     std::env::var("TCE_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(usual)
 }
@@ -324,7 +324,7 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
         let expected = format!("found {what} training run with other settings, seeds or files");
         assert!(message(&other).contains(&expected), "{}", message(&other));
     };
-    refuse("the results of");
+    refuse("the results of a training run");
     let results = ["policy-seed0.safetensors", "summary.json"].map(|file| dir.path().join("whole").join(file));
     let bytes = fs::read(&results[0]).unwrap();
     for lost in [&results[..1], &results[..]] {

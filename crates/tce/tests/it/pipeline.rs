@@ -318,6 +318,8 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     let compared = tce_json(dir.path(), &[&["compare"][..], &both, &data].concat());
     assert!(compared["policies"].as_array().unwrap().len() == 2 && compared["held_out"][0].is_number(), "{compared}");
     assert_eq!(compared["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
+    let of_the_zoo = tce_json(dir.path(), &[&["compare", "zoo:halfcheetah-source-medium"][..], &data].concat());
+    assert_eq!(of_the_zoo["policies"][0]["policy"], "zoo:halfcheetah-source-medium");
     let foreign = tce(dir.path(), &[&["compare", "zoo.safetensors"][..], &data].concat());
     assert_eq!(foreign.status.code(), Some(1), "no such policy");
 
