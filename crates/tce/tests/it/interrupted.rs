@@ -324,7 +324,7 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
         let expected = format!("found {what} training run with other settings, seeds or files");
         assert!(message(&other).contains(&expected), "{}", message(&other));
     };
-    refuse("the results of a training run");
+    refuse("the results of a");
     let results = ["policy-seed0.safetensors", "summary.json"].map(|file| dir.path().join("whole").join(file));
     let bytes = fs::read(&results[0]).unwrap();
     for lost in [&results[..1], &results[..]] {
