@@ -16,6 +16,27 @@
 //! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
 //!
 //! Everything here is deterministic: the results are the same bytes at any number of threads.
+//!
+//! ```
+//! use tce_data::{Agent, ScoreTable, Shift, Standardizer, Task, Transitions, reference_scores};
+//!
+//! // Two steps of a robot with one state and one action; the episode is cut after the second.
+//! let mut log = Transitions::new(1, 1);
+//! log.push(&[0.0], &[0.5], 1.0, &[2.0], false, false);
+//! log.push(&[2.0], &[0.5], 1.0, &[4.0], false, true);
+//! assert_eq!(log.len(), 2);
+//!
+//! // Standardised observations have mean 0 and spread 1.
+//! let z = Standardizer::fit(&log.observations, log.obs_dim).apply(&log.observations);
+//! assert_eq!(z, [-1.0, 1.0]);
+//!
+//! // 100 is the expert of the changed robot.
+//! let task: Task = "hopper-morph/medium/expert".parse()?;
+//! assert_eq!(task.with_arrow(), "hopper-morph:medium->expert");
+//! let scores = reference_scores(Agent::Hopper, Shift::Morph, ScoreTable::Otdf).expect("a robot of the benchmark");
+//! assert!(scores.normalised_score(0.0) < 1.0);
+//! # Ok::<(), String>(())
+//! ```
 
 mod actions;
 mod agents;

@@ -11,6 +11,15 @@
 //! | What does Theorem 1 say, and which λ does it choose? | [`bounds`] |
 //! | Should these rows be used, and why? | [`advice`] |
 //! | Everything about one run | [`Diagnosis`] |
+//!
+//! ```
+//! use tce_diagnosis::gaussian::{Normals, kl};
+//!
+//! // Two predictions of one number: N(0, 1), and N(2, 1).
+//! let p = Normals { mean: &[0.0], log_std: &[0.0], dim: 1 };
+//! let q = Normals { mean: &[2.0], log_std: &[0.0], dim: 1 };
+//! assert_eq!(kl(p, q), [2.0]);
+//! ```
 
 pub mod advice;
 pub mod bounds;

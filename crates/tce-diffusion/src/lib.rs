@@ -6,6 +6,16 @@
 //!
 //! Rows are row-major `f32` matrices of standardised, live dimensions; whoever calls standardises, drops dimensions
 //! without spread, and undoes both afterwards.
+//!
+//! ```
+//! use tce_diffusion::{Edm, Process};
+//!
+//! // EDM keeps the clean row as it is and adds noise up to σ_max.
+//! let process = Process::Edm(Edm::default());
+//! let (clean, noisy) = (process.level(0.0), process.level(1.0));
+//! assert_eq!((clean.alpha, noisy.alpha), (1.0, 1.0));
+//! assert!(clean.sigma < noisy.sigma);
+//! ```
 
 mod cycles;
 mod data;

@@ -19,6 +19,15 @@
 //! | one-step predictions in both domains, to filter rows and to test policies | [`dynamics`] |
 //! | the value of a policy, estimated from the rows alone | [`mod@fitted_q`] |
 //! | densities of a domain's transitions, to compare domains | [`transition_model`] |
+//!
+//! ```
+//! use tce_learn::losses::expectile_loss;
+//! use tce_nn::{Tensor, cpu};
+//!
+//! // IQL's V: at τ = .7 an error of 2 upwards counts 7/3 of one downwards.
+//! let loss = |u: f32| expectile_loss(Tensor::<3>::full([1, 1, 1], u, &cpu()), 0.7).into_scalar::<f32>();
+//! assert!((loss(2.0) / loss(-2.0) - 7.0 / 3.0).abs() < 1e-5);
+//! ```
 
 pub mod algorithms;
 pub mod core;

@@ -5,6 +5,17 @@
 //! than once per step (dense layers, layer normalisation, Adam, moving averages, a score network's trunk in sampling) goes through fused operations ([`dense`],
 //! [`Adam`], [`ResidualStack`]), of which
 //! the plain composition of burn operations is the definition and the test oracle.
+//!
+//! ```
+//! use tce_base::Streams;
+//! use tce_nn::{MlpConfig, Tensor, cpu};
+//!
+//! // Two networks of 3 inputs, one hidden layer and 1 output, of seeds 0 and 1: one set of tensors.
+//! let members = [Streams::new(0), Streams::new(1)];
+//! let networks = MlpConfig::relu(3, &[16], 1).init(&members, "critic", &cpu());
+//! let outputs = networks.forward(Tensor::<3>::ones([2, 5, 3], &cpu()));
+//! assert_eq!(outputs.dims(), [2, 5, 1]);
+//! ```
 
 use std::sync::OnceLock;
 

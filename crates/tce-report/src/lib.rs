@@ -3,6 +3,18 @@
 //!
 //! [`diagnosis`] shows what `tce diagnose` found. [`study::Study`] holds what there is, [`analysis::analyse`] decides every figure and warning, and [`html`] and [`text`] only
 //! print them.
+//!
+//! ```
+//! use tce_report::stats::{Scores, probability_of_improvement};
+//!
+//! // Scores of two methods on two tasks, three runs each.
+//! let ours = Scores::new(vec![vec![90.0, 95.0, 100.0], vec![60.0, 70.0, 80.0]])?;
+//! let theirs = Scores::new(vec![vec![50.0, 55.0, 60.0], vec![65.0, 75.0, 85.0]])?;
+//! assert_eq!(ours.mean(), 82.5);
+//! // All pairs on the first task, three of nine on the second.
+//! assert!((probability_of_improvement(&ours, &theirs) - (1.0 + 3.0 / 9.0) / 2.0).abs() < 1e-12);
+//! # Ok::<(), tce_report::stats::StatsError>(())
+//! ```
 
 pub mod analysis;
 pub mod diagnosis;

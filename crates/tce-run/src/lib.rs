@@ -11,6 +11,16 @@
 //! | Which policy is best, without a simulator? | [`off_policy_evaluation`], [`verdict`] |
 //! | Can generated rows be trusted? | [`diagnosis`] |
 //! | Many runs? | [`sweep`], [`study`] |
+//!
+//! ```
+//! use tce_run::layers::{Layered, Preset};
+//!
+//! // A preset, and a value on top of it.
+//! let set = ["generator.y_max=0.1".to_owned()];
+//! let config = Layered::new(Preset::Default, None, None, None, &set)?.config()?;
+//! assert_eq!((config.generator.y_max, config.learner.bc.ensemble), (0.1, 5));
+//! # Ok::<(), tce_run::error::Error>(())
+//! ```
 
 pub mod augment;
 pub mod config;

@@ -10,6 +10,20 @@
 //! | Do stored transitions follow the dynamics? | [`replay`] (whole data sets), [`simulate`] (single rows) |
 //! | Is MuJoCo available? | [`open_library`], called before a command starts; everything else opens it automatically |
 //! | Would a generated state end the episode? | [`terminal_rule`] |
+//!
+//! ```
+//! use tce_base::Streams;
+//! use tce_data::{Agent, Shift};
+//! use tce_sim::Env;
+//!
+//! let mut hopper = Env::new(Agent::Hopper, Shift::Morph)?;
+//! let mut observation = vec![0.0; Agent::Hopper.dims().0];
+//! hopper.reset(&mut Streams::new(0).stream("reset"), &mut observation);
+//! let step = hopper.step(&[0.0; 3], &mut observation);
+//! // It stands: one reward for being alive, and no action to pay for.
+//! assert!(!step.terminal && (step.reward - 1.0).abs() < 0.1);
+//! # Ok::<(), tce_sim::SimError>(())
+//! ```
 
 mod actor;
 mod analysis;

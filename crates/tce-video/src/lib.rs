@@ -1,4 +1,11 @@
 //! Videos as files: pictures from `tce-sim` are drawn on all cores and encoded in order.
+//!
+//! ```
+//! // The ending of the file decides what is written.
+//! assert!(tce_video::parse_video("fall.gif").is_ok() && tce_video::parse_video("fall.mp4").is_ok());
+//! assert!(tce_video::parse_video("fall.txt").is_err());
+//! assert_eq!(tce_video::parse_size("640x480"), Ok([640, 480]));
+//! ```
 
 mod error;
 mod gif;
