@@ -20,11 +20,11 @@ HERE = Path(__file__).resolve().parent
 PAPER = HERE.parent / "crates/tce-report/paper"
 AGENTS = {"halfcheetah": "HalfCheetah", "hopper": "Hopper", "walker2d": "Walker2d", "ant": "Ant"}
 SHIFTS = ["morph", "kinematic", "gravity"]
-OURS = [("bc-ensemble", "five clones of the target rows, ours", "#3d6b94"), ("tce-og", "TCE(OG), ours", "#d9772b")]
+BLUE, ORANGE, GREEN, GREY, PALE = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c", "#dfe2e7"
+OURS = [("bc-ensemble", "five clones of the target rows, ours", BLUE), ("tce-og", "TCE(OG), ours", ORANGE)]
 # How a method is called in records from before it was the default.
 SAME = {"tce-og (fade)": "tce-og"}
-THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", "#dfe2e7")]
-BLUE, ORANGE, GREEN, GREY = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c"
+THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", PALE)]
 
 
 def runs():
@@ -75,8 +75,7 @@ def tables(page):
 
 def number(text):
     """The first number of a cell."""
-    match = re.search(r"-?\d*\.?\d+(e-?\d+)?", text)
-    return float(match[0]) if match else None
+    return float(re.search(r"-?\d*\.?\d+(e-?\d+)?", text)[0])
 
 
 def panels(rows, columns, size, **options):
@@ -90,6 +89,24 @@ def save(figure, path):
     figure.tight_layout()
     figure.savefig(path, metadata={"Date": None})
     plt.close(figure)
+
+
+def dots(panel, methods, label, path):
+    """A panel a title, a line a method, a dot a score. `panel` has (title, {method: scores}) and `methods` every method's colour."""
+    figure, axes = panels(1, len(panel), (9, 0.2 * len(methods) + 1.5), sharey=True)
+    for axis, (title, found) in zip(axes, panel):
+        for place, (method, colour) in enumerate(methods.items()):
+            values = found.get(method, [])
+            axis.plot(values, [place] * len(values), "o", color=colour, markersize=4, alpha=0.7)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlim(-3, 106)
+        axis.set_xticks([0, 50, 100])
+        axis.grid(axis="y", color="#eee")
+        axis.set_axisbelow(True)
+    axes[0].set_yticks(range(len(methods)), methods, fontsize=8)
+    axes[0].invert_yaxis()
+    figure.supxlabel(label, fontsize=9)
+    save(figure, path)
 
 
 def results():
@@ -120,31 +137,20 @@ def results():
 def prior_methods():
     """Scores of single runs of every method, robot by robot."""
     order = ["bc", "target-only", "dara", "srpo", "igdf", "bosa", "otdf", "dmc", "meta-dt", "synther", "rebrac", "td3-bc"]
-    found = defaultdict(list)
+    found = defaultdict(lambda: defaultdict(list))
     for record, run in runs():
         method = run["method"].replace(" 2026-11 gpu", "").replace(" 2026-11", "")
-        if record.endswith("prior-methods") and method in order:
-            found[run["task"].split("-")[0], method] += [m["verdict"]["score"] for m in run["folder"]["members"]]
-    figure, axes = panels(1, len(AGENTS), (9, 3.9), sharey=True)
-    for axis, (agent, name) in zip(axes, AGENTS.items()):
-        for place, method in enumerate(order):
-            values = found[agent, method]
-            axis.plot(values, [place] * len(values), "o", color=BLUE if method in order[:2] else ORANGE, markersize=4, alpha=0.7)
-        axis.set_title(name, fontsize=10)
-        axis.set_xlim(-3, 106)
-        axis.set_xticks([0, 50, 100])
-        axis.grid(axis="y", color="#eee")
-        axis.set_axisbelow(True)
-    axes[0].set_yticks(range(len(order)), order)
-    axes[0].invert_yaxis()
-    figure.supxlabel("normalised score of single runs; blue: the target's rows alone", fontsize=9)
-    save(figure, HERE / "prior-methods.svg")
+        if record.endswith("prior-methods"):
+            found[run["task"].split("-")[0]][method] += [m["verdict"]["score"] for m in run["folder"]["members"]]
+    methods = {method: BLUE if method in order[:2] else ORANGE for method in order}
+    panel = [(name, found[agent]) for agent, name in AGENTS.items()]
+    dots(panel, methods, "normalised score of single runs; blue: the target's rows alone", HERE / "prior-methods.svg")
 
 
 def evidence():
     """Mean and standard deviation over seeds, beside the paper's TCE(OG)."""
     rows = tables("evidence.md")[0][1][:4]
-    methods = [(name, colour) for name, colour in zip(list(rows[0])[1:6], ["#dfe2e7", BLUE, ORANGE, GREEN, GREY])]
+    methods = list(zip(list(rows[0])[1:6], [PALE, BLUE, ORANGE, GREEN, GREY]))
     figure, (axis,) = panels(1, 1, (8, 3.2))
     for k, (method, colour) in enumerate(methods):
         for place, row in enumerate(rows):
@@ -171,7 +177,7 @@ def generator():
             points = sorted((number(row["NFE"]), number(row["consistency ŷ = 0"])) for row in own)
             axis.plot(*zip(*points), "o-", color=colour, markersize=4, linewidth=1, label=family)
         axis.set_xscale("log")
-        axis.set_xticks([5, 10, 20, 50, 1000], [5, 10, 20, 50, 1000], minor=False)
+        axis.set_xticks([5, 10, 20, 50, 1000], [5, 10, 20, 50, 1000])
         axis.minorticks_off()
         axis.set_ylim(0)
         axis.set_title(heading.split(":")[0], fontsize=10)
@@ -200,21 +206,9 @@ def replay():
 def oldest_scores():
     """Scores of single seeds by method, task by task."""
     found = [(heading, rows) for heading, rows in tables("scores.md") if rows and "seeds" in rows[0] and heading.endswith("to-expert")]
-    methods = list(dict.fromkeys(row["method"] for _, rows in found for row in rows))
-    figure, axes = panels(1, len(found), (9, 3.1), sharey=True)
-    for axis, (heading, rows) in zip(axes, found):
-        for row in rows:
-            values = [number(cell) for cell in row["seeds"].split(",")]
-            place = methods.index(row["method"])
-            axis.plot(values, [place] * len(values), "o", color=ORANGE if "TCE" in row["method"] else BLUE, markersize=4, alpha=0.7)
-        axis.set_title(heading.split("_")[0], fontsize=9)
-        axis.set_xlim(-3, 106)
-        axis.grid(axis="y", color="#eee")
-        axis.set_axisbelow(True)
-    axes[0].set_yticks(range(len(methods)), methods, fontsize=8)
-    axes[0].invert_yaxis()
-    figure.supxlabel("normalised score of single seeds, medium source, expert target", fontsize=9)
-    save(figure, HERE / "scores.svg")
+    methods = {row["method"]: ORANGE if "TCE" in row["method"] else BLUE for _, rows in found for row in rows}
+    panel = [(heading.split("_")[0], {row["method"]: [number(cell) for cell in row["seeds"].split(",")] for row in rows}) for heading, rows in found]
+    dots(panel, methods, "normalised score of single seeds, medium source, expert target", HERE / "scores.svg")
 
 
 def main():

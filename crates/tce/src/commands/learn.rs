@@ -103,11 +103,8 @@ fn render(report: &Trained) -> String {
             text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
         }
     }
-    if let Some(kept) = &report.verdict {
-        // A single policy is taken without being tried.
-        if kept.verdict.tried.is_empty() {
-            return text + "\n" + &kept.sentences();
-        }
+    // A single policy is taken without being tried.
+    if let Some(kept) = report.verdict.as_ref().filter(|kept| !kept.verdict.tried.is_empty()) {
         let rows = kept.verdict.tried.iter().map(|t| {
             [
                 if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
@@ -129,10 +126,12 @@ fn render(report: &Trained) -> String {
              supported: the imagined return until the episode is far from every target state; it decides\n\
              survival: share of a whole episode's steps that the policy reached there\n\
              fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
-             action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n\n{}",
+             action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n",
             table(&header, rows.chain(logged)),
-            kept.sentences()
         );
+    }
+    if let Some(kept) = &report.verdict {
+        text += &format!("\n{}", kept.sentences());
     }
     text
 }
