@@ -60,7 +60,7 @@ impl GeneratorConfig {
             transition_steps: Length::Auto,
             until_done: UntilDoneConfig::default(),
             batch: 128,
-            learning_rate: 5e-4,
+            learning_rate: 1e-3,
             schedule: Schedule::Cosine,
             ema: 0.999,
             balanced: true,
@@ -156,7 +156,7 @@ pub struct UntilDoneConfig {
 
 impl Default for UntilDoneConfig {
     fn default() -> Self {
-        Self { first: 7_500, state_limit: 60_000, transition_limit: 240_000, gain: 0.1, held_out: 0.05 }
+        Self { first: 7_500, state_limit: 60_000, transition_limit: 120_000, gain: 0.1, held_out: 0.05 }
     }
 }
 
