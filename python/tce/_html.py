@@ -24,14 +24,14 @@ def training_run(run: TrainingRun) -> str:
     """Candidates, the recommendation, and the folder."""
     if run.verdict is None:
         return f"<p>{len(run.policies)} policies in <code>{escape(str(run.out))}</code></p>"
-    header = ["policy", "imagined return", "supported", "± standard error", "survived", "fitted Q", "action error"]
+    header = ["policy", "imagined return", "supported", "± standard error", "support", "fitted Q", "action error"]
     rows = [
         [
             t["name"] + (" (baseline)" if t["baseline"] else ""),
             _number(t["imagined_return"]),
             _number(t.get("supported_return")),
             _number(t["standard_error"]),
-            f"{100 * t['survival']:.0f} %",
+            "-" if t.get("support") is None else f"{100 * t['support']:.0f} %",
             _number((t.get("fitted_q") or [None])[0]),
             _number(t["action_error"], 3),
         ]

@@ -15,6 +15,7 @@
 //! | imagined return | mean return of the imagined episodes |
 //! | supported return | the same until the episode is far from the target's states |
 //! | survival | share of the steps of whole episodes that were reached |
+//! | support | the same until the episode is far from the target's states: of how much of an episode the supported return tells |
 //! | distance | median distance of the states on the way to the nearest target state, in units of the median distance between target rows of different episodes |
 //! | action error | RMSE of the policy's actions at target states against the behaviour's |
 //! | fitted Q | discounted return from the starts of the target's episodes, by [`mod@tce_learn::fitted_q`]: no model of the dynamics |
@@ -81,6 +82,8 @@ pub struct OffPolicyEstimate {
     pub supported_return: f64,
     /// Mean share of the steps of a whole episode.
     pub survival: f64,
+    /// The same until the episodes are far from the target's states.
+    pub support: f64,
     /// Median distance to the nearest target state.
     pub distance: f64,
     /// RMSE of the actions at target states.
@@ -219,16 +222,21 @@ impl OffPolicyEvaluator {
             }
         }
         let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t)? };
-        let returns = returns.concat();
-        let supported = self.counted(&returns, left, &distances, &passed);
+        let (returns, steps) = (returns.concat(), steps.concat());
+        let left = self.left(left, &distances, &passed);
+        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(self.worst, self.limit));
+        let supported: Vec<f64> = returns.iter().zip(&left).map(count).collect();
+        let known: usize = steps.iter().zip(&left).map(|(&all, left)| left.map_or(all, |l| l.steps)).sum();
         let n = returns.len() as f64;
+        let share = |steps: usize| steps as f64 / (n * self.limit as f64);
         let (mean, std) = mean_std(&returns);
         let actions = self.actions_at(policy, &t.observations);
         Ok(OffPolicyEstimate {
             imagined_return: mean,
             standard_error: std / n.sqrt(),
             supported_return: mean_std(&supported).0,
-            survival: steps.concat().iter().sum::<usize>() as f64 / (n * self.limit as f64),
+            survival: share(steps.iter().sum()),
+            support: share(known),
             distance: if visited.is_empty() { f64::INFINITY } else { median(distances) / self.spacing },
             action_error: rmse(&actions, &t.actions),
             returns,
@@ -238,23 +246,16 @@ impl OffPolicyEvaluator {
 }
 
 impl OffPolicyEvaluator {
-    /// The returns of episodes until they leave what the models know: where they `left` its bounds, or where one of the states that they
-    /// `passed` is far from the target's, whichever comes first. `distances` are those of the passed states, in the order of the steps.
-    fn counted(
-        &self,
-        returns: &[f64],
-        mut left: Vec<Option<Left>>,
-        distances: &[f32],
-        passed: &[(usize, Left)],
-    ) -> Vec<f64> {
+    /// Where episodes leave what the models know: where they `left` its bounds, or where one of the states that they `passed` is far from
+    /// the target's, whichever comes first. `distances` are those of the passed states, in the order of the steps.
+    fn left(&self, mut left: Vec<Option<Left>>, distances: &[f32], passed: &[(usize, Left)]) -> Vec<Option<Left>> {
         for (&distance, &(episode, here)) in distances.iter().zip(passed) {
             let earlier = left[episode].is_none_or(|l| here.steps < l.steps);
             if earlier && f64::from(distance) > FAR * self.spacing {
                 left[episode] = Some(here);
             }
         }
-        let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(self.worst, self.limit));
-        returns.iter().zip(&left).map(count).collect()
+        left
     }
 
     /// The mean actions of a policy, in the box of the rows. A policy that remembers its episode acts as in a first state.

@@ -5,6 +5,7 @@ mod bench;
 mod commands;
 mod conclusion;
 mod costs;
+mod estimates;
 #[cfg(test)]
 mod fuzz;
 mod output;

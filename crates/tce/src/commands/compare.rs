@@ -10,9 +10,11 @@ use tce_run::error::{Error, Result};
 use tce_run::inputs::Inputs;
 use tce_run::off_policy_evaluation::{OffPolicyEstimate, OffPolicyEvaluator};
 use tce_run::own::Own;
+use tce_run::verdict::mean_and_error;
 use tce_zoo::actors::read_policy;
 
-use crate::output::{Output, table};
+use crate::estimates::{Estimated, estimates};
+use crate::output::Output;
 
 /// Arguments of `compare`.
 #[derive(Debug, Args)]
@@ -99,24 +101,21 @@ impl CompareArgs {
 fn render(report: &Report) -> String {
     let rows = report.policies.iter().map(|l| {
         let j = &l.estimate;
-        [
-            l.policy.display().to_string(),
-            format!("{:.0} ± {:.0}", j.imagined_return, j.standard_error),
-            format!("{:.0}", j.supported_return),
-            format!("{:.0} %", 100.0 * j.survival),
-            format!("{:.2}", j.distance),
-            l.fitted_q.as_ref().map_or("-".into(), |v| format!("{:.1} ± {:.1}", v.mean(), v.standard_error())),
-            format!("{:.3}", j.action_error),
-        ]
+        Estimated {
+            policy: l.policy.display().to_string(),
+            imagined_return: j.imagined_return,
+            supported_return: j.supported_return,
+            standard_error: mean_and_error(&j.supported)[1],
+            support: Some(j.support),
+            fitted_q: l.fitted_q.as_ref().map(|v| [v.mean(), v.standard_error()]),
+            action_error: j.action_error,
+        }
     });
-    let header = ["policy", "imagined return", "supported", "survival", "distance", "fitted Q", "action error"];
+    let logged = report.policies.iter().any(|l| l.fitted_q.is_some()).then_some(report.behaviour_value);
     format!(
-        "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n{}\n\
-         supported: the imagined return until an episode is far from the target's states\n\
-         fitted Q: return with each later reward worth 1 % less; the target's logged episodes have {:.1}",
+        "learned dynamics, errors on held-out target rows: median {:.3}, 95th percentile {:.3} of a step\n\n{}",
         report.held_out[0],
         report.held_out[1],
-        table(&header, rows),
-        report.behaviour_value
+        estimates(rows, logged),
     )
 }

@@ -14,6 +14,7 @@ use tce_run::own::Own;
 use tce_run::pipeline::seeds;
 use tce_run::training_run::{Comparison, Trained, TrainingRun, ensure_fits};
 
+use crate::estimates::{Estimated, estimates};
 use crate::output::{Output, list as listed, table};
 
 /// Arguments of `learn`.
@@ -105,30 +106,16 @@ fn render(report: &Trained) -> String {
     }
     // A single policy is taken without being tried.
     if let Some(kept) = report.verdict.as_ref().filter(|kept| !kept.verdict.tried.is_empty()) {
-        let rows = kept.verdict.tried.iter().map(|t| {
-            [
-                if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
-                format!("{:.1}", t.imagined_return),
-                format!("{:.1} ± {:.1}", t.supported_return.unwrap_or(t.imagined_return), t.standard_error),
-                format!("{:.0} %", 100.0 * t.survival),
-                t.fitted_q.map_or("-".into(), |[value, error]| format!("{value:.1} ± {error:.1}")),
-                format!("{:.3}", t.action_error),
-            ]
+        let rows = kept.verdict.tried.iter().map(|t| Estimated {
+            policy: if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },
+            imagined_return: t.imagined_return,
+            supported_return: t.supported_return.unwrap_or(t.imagined_return),
+            standard_error: t.standard_error,
+            support: t.support,
+            fitted_q: t.fitted_q,
+            action_error: t.action_error,
         });
-        let logged = kept.verdict.behaviour_value.map(|value| {
-            let name = "the target's logged episodes".to_owned();
-            [name, "-".into(), "-".into(), "-".into(), format!("{value:.1}"), "0".into()]
-        });
-        let header = ["policy", "imagined return", "supported", "survival", "fitted Q", "action error"];
-        text += &format!(
-            "\nEstimated without a simulator (± standard error):\n{}\n\
-             imagined return: of episodes in learned dynamics of the robot\n\
-             supported: the imagined return until the episode is far from every target state; it decides\n\
-             survival: share of a whole episode's steps that the policy reached there\n\
-             fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
-             action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n",
-            table(&header, rows.chain(logged)),
-        );
+        text += &format!("\n{}", estimates(rows, kept.verdict.behaviour_value));
     }
     if let Some(kept) = &report.verdict {
         text += &format!("\n{}", kept.sentences());
