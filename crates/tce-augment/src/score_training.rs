@@ -1,7 +1,7 @@
 //! Training of score networks, for a given length or until a criterion on held-out rows no longer falls.
 
-use tce_base::random::choose;
 use tce_base::{Progress, Streams};
+use tce_data::hold_out_runs;
 use tce_diffusion::{CycleEnd, Process, Sampler, ScoreData, ScoreModel, Trainer, UntilDone};
 use tce_nn::Checkpoints;
 
@@ -107,39 +107,8 @@ pub(crate) fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress 
     Progress::new(label, (rows * sampler.evaluations()) as u64, "evaluations")
 }
 
-/// Rows that follow each other and are held out together: neighbours in time are too much alike for one to test the other.
-const HELD_OUT_RUN: usize = 25;
-
-/// The rows of `n` to train on, and the share that is held out, in runs at random places; both ascending. The same for all seeds.
-pub fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
-    // Of a single run one half would be held out from the other.
-    let length = if n > HELD_OUT_RUN { HELD_OUT_RUN } else { n.div_ceil(2).max(1) };
-    let runs = n.div_ceil(length);
-    let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
-    let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
-    (0..n).partition(|i| chosen.binary_search(&(i / length)).is_err())
-}
-
 /// Of `n` target rows, those that the networks of `config` are trained on, and those that are held out to tell when to stop.
 pub fn held_out_rows(n: usize, config: &GeneratorConfig) -> (Vec<usize>, Vec<usize>) {
     let auto = [config.state_steps, config.transition_steps].contains(&Length::Auto);
     hold_out_runs(n, if auto { config.until_done.held_out } else { 0.0 })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn held_out_rows_come_in_runs_and_are_the_share() {
-        let (kept, held_out) = hold_out_runs(5000, 0.05);
-        assert_eq!((kept.len(), held_out.len()), (4750, 250));
-        assert!(held_out.chunks(HELD_OUT_RUN).all(|run| run[0] % HELD_OUT_RUN == 0 && run[24] == run[0] + 24));
-        let mut all = [kept, held_out].concat();
-        all.sort_unstable();
-        assert_eq!(all, (0..5000).collect::<Vec<_>>());
-        assert_eq!(hold_out_runs(100, 0.0), ((0..100).collect(), vec![]));
-        let (kept, held_out) = hold_out_runs(60, 0.01);
-        assert!(!held_out.is_empty() && kept.len() >= 35, "at least one run, never all");
-    }
 }

@@ -11,6 +11,7 @@
 //! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
 //! | Which transfer problems are there? | [`Task`] |
 //! | Which trajectories of a mixed set to learn from? | [`choose_trajectories`] |
+//! | Which rows does a training not see? | [`hold_out_runs`], [`fold_of_runs`] |
 //! | Which values can a row have at all? | [`Support`]: bounds, constants, flags, unit vectors |
 //! | Which generated rows are outliers? | [`zscore_keep`] (Eq. 8) |
 //! | Which source rows are close to the target? | [`nn_distances`] and [`lambda_quantile_select`] (Eq. 9), [`transport_costs`] (OTDF), [`density_scores`] (DmC) |
@@ -45,6 +46,7 @@ pub mod density;
 mod error;
 pub mod files;
 mod filter;
+mod held_out;
 mod inspect;
 mod moments;
 mod neighbours;
@@ -69,6 +71,7 @@ pub use files::{
     read_attributes, save_d4rl, save_minari,
 };
 pub use filter::{largest_z, zscore_keep};
+pub use held_out::{fold_of_runs, hold_out_runs};
 pub use inspect::{DimensionSummary, Inspection, Summary, inspect};
 pub use neighbours::{NeighbourOptions, Units, lambda_quantile_select, nn_distances};
 pub use quality::Quality;

@@ -38,8 +38,8 @@ pub mod policies;
 // Modules are re-exported under their own names; their folder only matters to readers of the source.
 use crate::algorithms::iql_config;
 pub use crate::algorithms::{
-    bc, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac, selection,
-    srpo, td3_bc,
+    bc, bc_dropout, bosa, dara, deterministic, dmc, igdf, iql, meta_dt, method, on_iql, otdf, rebrac, regulariser, sac,
+    selection, srpo, td3_bc,
 };
 use crate::core::{blocks, buffer, mode, shares, training};
 pub use crate::core::{losses, sequences};
@@ -52,6 +52,7 @@ use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
 pub use bc::{Bc, BcConfig, CloneLoss};
+pub use bc_dropout::DropoutRate;
 pub use blocks::map_rows;
 pub use bosa::{Bosa, BosaConfig};
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};

@@ -25,9 +25,10 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_augment::score_training::hold_out_runs;
 use tce_base::{Streams, mean_std, sha256_hex};
-use tce_data::{ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, nn_distances};
+use tce_data::{
+    ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, hold_out_runs, nn_distances,
+};
 use tce_learn::{
     Domain, Dynamics, DynamicsConfig, FittedQConfig, FittedValue, Learner, Policy, PolicyActions, discounted_return,
     fitted_q, rmse, train_dynamics,

@@ -149,7 +149,7 @@ mod tests {
         for (preset, set, told) in [
             (Preset::Default, "learner.bc.batch=0", "learner.bc.batch = 0 (128)"),
             (Preset::Default, "learner.bc.loss=likelihood", "learner.bc.loss = \"likelihood\" (\"squared\")"),
-            (Preset::Default, "learner.bc.dropout=0.2", "learner.bc.dropout = 0.2 (0.0)"),
+            (Preset::Default, "learner.bc.dropout=0.2", "learner.bc.dropout = 0.2 (\"auto\")"),
             (Preset::Default, "filter.by=consistency", "filter.by = \"consistency\" (\"zscore\")"),
             (Preset::Default, "filter.margin=3.5", "filter.margin = 3.5 (2.0)"),
             (Preset::Paper, "learner.bc.batch=64", "learner.bc.batch = 64 (0)"),

@@ -5,7 +5,7 @@
 //! | symbol | field | default | source |
 //! |---|---|---|---|
 //! | - | `actor` | deterministic, 256-256, Adam 3e-4, cosine | as the policies of IQL |
-//! | - | `dropout` | 0 | of hidden units, while it is trained: Srivastava et al. 2014 |
+//! | - | `dropout` | 0 | of hidden units, while it is trained: Srivastava et al. 2014; or chosen by the data, [`crate::bc_dropout`] |
 //! | - | `loss` | squared | own: or the likelihood of a tanh-Gaussian policy, [`Actor::likelihood_loss`] |
 //! | - | `batch` | 0 | own: rows of each update; 0: `learner.batch` |
 //! | E | `ensemble` | 1 | own: policies whose outputs are averaged before the tanh |
@@ -13,10 +13,9 @@
 //! | - | `fade` | 0 | own: other rows first, the target's alone at last, see below |
 //! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
 //!
-//! Behaviour policies are sampled. A network that fits 5000 noisy actions exactly therefore fits their noise: on
-//! HalfCheetah, two layers have an error of .04 on their own rows and .20 on an unseen episode. Dropout lowers the
-//! second error, but the policies score lower; a third layer lowers it, and the policies score higher
-//! (bench/expansion.md).
+//! A network that fits 5000 actions exactly says little between them. Where the rows lie close to each other this is
+//! enough; where they do not, dropout is worth 28 points, and elsewhere it costs as many ([`crate::bc_dropout`]). A third
+//! layer lowers the error between the rows, and the policies score higher (bench/expansion.md).
 //!
 //! Clones of one data set differ in their initial weights, and this decides whether they fall. The mean of several
 //! clones makes fewer of the errors that they do not share: Walker2d, four clones of the same rows, 48 to 88 points
@@ -43,6 +42,7 @@ use tce_base::Streams;
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 
 use crate::actor::{Actor, ActorConfig, PolicyForm};
+use crate::bc_dropout::{DropoutRate, chosen};
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::method::{About, Built, LearnedRows, Method, OtherRows, RowScores, Setup};
@@ -69,7 +69,9 @@ impl Method for BcConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        within("dropout", self.dropout, 0.0..=0.9)?;
+        if let DropoutRate::Share(share) = self.dropout {
+            within("dropout", share, 0.0..=0.9)?;
+        }
         within("fade", self.fade, 0.0..=1.0)?;
         within("ensemble", self.ensemble as f64, 1.0..=64.0)?;
         if self.ensemble > 1 && self.loss == CloneLoss::Squared && self.actor.form != PolicyForm::TanhMean {
@@ -81,7 +83,14 @@ impl Method for BcConfig {
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
-        Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)))
+        let rates = match self.dropout {
+            DropoutRate::Share(share) => vec![share; on.buffer.members().len()],
+            DropoutRate::Auto => match chosen(on.buffer, self, on.steps, on.place, on.device)? {
+                Some(rates) => rates,
+                None => return Ok(None),
+            },
+        };
+        Ok(Some(Box::new(Bc::with_dropout(on.buffer, self, rates, on.steps, on.device)?)))
     }
 
     fn batch(&self, batch: usize) -> usize {
@@ -109,10 +118,10 @@ pub struct BcConfig {
     /// Policies that are trained side by side; their outputs are averaged before the tanh.
     #[schemars(range(min = 1, max = 64))]
     pub ensemble: usize,
-    /// Share of hidden units that are left out of each update, at random.
+    /// Share of hidden units that are left out of each update, at random. "auto": 0.3 where it lowers a clone's error at rows that it has
+    /// not seen, else none.
     #[serde(skip_serializing_if = "is_zero")]
-    #[schemars(range(min = 0.0, max = 0.9))]
-    pub dropout: f64,
+    pub dropout: DropoutRate,
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
     /// as without them.
     pub mixed_steps: u64,
@@ -134,7 +143,7 @@ impl Default for BcConfig {
         Self {
             actor: ActorConfig::default(),
             ensemble: 1,
-            dropout: 0.0,
+            dropout: DropoutRate::default(),
             mixed_steps: 0,
             fade: 0.0,
             batch: 0,
@@ -174,7 +183,10 @@ pub struct Bc {
     /// One population for each position in the ensembles.
     actors: Vec<Actor>,
     members: Vec<Streams>,
-    dropout: f64,
+    /// Of every member.
+    dropout: Vec<f64>,
+    /// Whether the data chose it; then it is a metric.
+    told: bool,
     loss: CloneLoss,
 }
 
@@ -182,8 +194,22 @@ impl Bc {
     /// New policies for the members of `buffer`, to be trained for `steps` steps.
     ///
     /// # Errors
-    /// If the configuration cannot be used.
+    /// If the configuration cannot be used. `dropout = "auto"` is a training of its own: [`Method::build`] does it.
     pub fn new(buffer: &Buffer, config: &BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
+        let DropoutRate::Share(share) = config.dropout else {
+            return Err(LearnError::invalid("dropout", "\"auto\"", "a share", "build the learner with Method::build"));
+        };
+        Self::with_dropout(buffer, config, vec![share; buffer.members().len()], steps, device)
+    }
+
+    /// [`Bc::new`], with the dropout of every member.
+    pub(crate) fn with_dropout(
+        buffer: &Buffer,
+        config: &BcConfig,
+        dropout: Vec<f64>,
+        steps: u64,
+        device: &Device,
+    ) -> Result<Self, LearnError> {
         config.check()?;
         let form = match config.loss {
             CloneLoss::Squared => config.actor.form,
@@ -195,7 +221,8 @@ impl Bc {
             k => Actor::named(&format!("policy {k}"), buffer, &policy, steps, device),
         };
         let actors = (0..config.ensemble).map(actor).collect::<Result<_, _>>()?;
-        Ok(Self { actors, members: buffer.streams(), dropout: config.dropout, loss: config.loss })
+        let told = config.dropout == DropoutRate::Auto;
+        Ok(Self { actors, members: buffer.streams(), dropout, told, loss: config.loss })
     }
 }
 
@@ -220,16 +247,20 @@ fn prefix(k: usize) -> String {
 impl Learner for Bc {
     fn update(&mut self, batch: &Minibatch, at: u64, meter: &mut Meter) {
         let masks = |k: usize| -> Vec<Dropout> {
-            if self.dropout == 0.0 {
+            if self.dropout.iter().all(|&share| share == 0.0) {
                 // Creating a generator for each update and policy costs time.
                 return Vec::new();
             }
             let name = format!("dropout {k}");
-            self.members.iter().map(|m| Dropout::new(self.dropout, m.indexed(&name, at))).collect()
+            let members = self.members.iter().zip(&self.dropout);
+            members.map(|(m, &share)| Dropout::new(share, m.indexed(&name, at))).collect()
         };
         let actors = self.actors.par_iter_mut().enumerate();
         let losses: Vec<_> = actors.map(|(k, actor)| step(actor, batch, masks(k), at, self.loss)).collect();
         losses.iter().for_each(|loss| meter.record("policy_loss", loss));
+        if self.told && meter.active() {
+            meter.add("dropout", self.dropout.clone());
+        }
     }
 
     fn state(&self) -> NamedParameters {

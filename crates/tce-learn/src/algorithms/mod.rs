@@ -1,6 +1,7 @@
 //! One file per algorithm, and the code that several of them share.
 
 pub mod bc;
+pub mod bc_dropout;
 pub mod bosa;
 pub mod dara;
 pub mod deterministic;

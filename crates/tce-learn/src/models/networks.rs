@@ -105,21 +105,25 @@ impl Dropout {
         Self::apply_members(std::slice::from_mut(self), x)
     }
 
-    /// Applies to each member of a population `[P, ...]` its own next mask. All members have the same rate.
+    /// Applies to each member of a population `[P, ...]` its own next mask.
     pub(crate) fn apply_members<const D: usize>(members: &mut [Self], x: Tensor<D>) -> Tensor<D> {
-        let dropped = members.first().filter(|m| m.rng.is_some()).map_or(0, |m| m.dropped);
-        if dropped == 0 {
+        if members.iter().all(|m| m.rng.is_none() || m.dropped == 0) {
             return x;
         }
         let dims = x.dims();
+        let elements = dims.iter().product::<usize>();
+        let mut mask = vec![1.0; elements];
+        let share = elements / members.len();
         // Two bytes per element: a float each would take twice the time, which is a tenth of an update.
-        let mut bytes = vec![0; 2 * dims.iter().product::<usize>()];
-        let share = bytes.len() / members.len();
-        let rngs = members.iter_mut().filter_map(|m| m.rng.as_mut());
-        rngs.zip(bytes.chunks_exact_mut(share)).for_each(|(rng, bytes)| rng.fill_bytes(bytes));
-        let kept = 65536.0 / (65536 - dropped) as f32;
-        let draws = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
-        let mask: Vec<f32> = draws.map(|draw| if draw < dropped { 0.0 } else { kept }).collect();
+        let mut bytes = vec![0; 2 * share];
+        for (member, mask) in members.iter_mut().zip(mask.chunks_exact_mut(share)) {
+            let dropped = member.dropped;
+            let Some(rng) = member.rng.as_mut().filter(|_| dropped > 0) else { continue };
+            rng.fill_bytes(&mut bytes);
+            let kept = 65536.0 / (65536 - dropped) as f32;
+            let draws = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
+            mask.iter_mut().zip(draws).for_each(|(mask, draw)| *mask = if draw < dropped { 0.0 } else { kept });
+        }
         let device = x.device().inner();
         x * Tensor::from_inner(Tensor::from_data(TensorData::new(mask, dims), &device))
     }

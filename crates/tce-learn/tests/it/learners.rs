@@ -13,8 +13,8 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, LabelConfig, LearnError, Learner, Member, Method, Mode, Place,
-    Policy, PolicyLearner, best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, DropoutRate, LabelConfig, LearnError, Learner, Member, Method, Mode,
+    Place, Policy, PolicyLearner, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -115,7 +115,13 @@ fn dropout_keeps_a_clone_from_fitting_the_noise_of_its_rows() {
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 64).unwrap();
     let error = |dropout: f64| {
         let actor = ActorConfig { hidden: vec![128, 128, 128], lr: 1e-3, ..ActorConfig::default() };
-        let mut bc = Bc::new(&buffer, &BcConfig { actor, dropout, ..BcConfig::default() }, 1500, &cpu()).unwrap();
+        let mut bc = Bc::new(
+            &buffer,
+            &BcConfig { actor, dropout: DropoutRate::Share(dropout), ..BcConfig::default() },
+            1500,
+            &cpu(),
+        )
+        .unwrap();
         run(&mut bc, &buffer, 1500);
         // At the training rows themselves, anything fitted beyond the behaviour's mean is noise.
         let square = |policy: &Policy, i: usize| (action(policy, data.observation(i))[0] - data.action(i)[0]).powi(2);
@@ -132,7 +138,7 @@ fn dropout_is_a_members_own_and_a_training_with_it_resumes() {
     let data = noisy_data();
     let members = [member(1, &data, true), member(2, &data, true)];
     let actor = ActorConfig { hidden: vec![16, 16], ..ActorConfig::default() };
-    let config = BcConfig { actor, dropout: 0.3, ensemble: 2, ..BcConfig::default() };
+    let config = BcConfig { actor, dropout: DropoutRate::Share(0.3), ensemble: 2, ..BcConfig::default() };
     let new = |members: &[Member]| {
         let buffer = Buffer::new(members.to_vec(), 32).unwrap();
         (Bc::new(&buffer, &config, 20, &cpu()).unwrap(), buffer)
