@@ -23,14 +23,13 @@ use std::sync::Arc;
 use serde::de::{Error, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tce_base::Streams;
-use tce_data::fold_of_runs;
+use tce_data::{Transitions, fold_of_runs};
 use tce_nn::Device;
 
-use super::bc::{Bc, BcConfig};
 use crate::buffer::{Buffer, Member};
 use crate::error::LearnError;
 use crate::labels::rmse;
-use crate::policy::PolicyLearner;
+use crate::policy::{Policy, PolicyLearner};
 use crate::training::{Place, prepare};
 
 /// The dropout of clones that need it.
@@ -107,31 +106,38 @@ impl<'de> Deserialize<'de> for DropoutRate {
 }
 
 /// The dropout of every member of `buffer`, whose clones are trained for `steps` steps. It depends on the member's target rows and their
-/// standardisation, and on nothing else: members of different seeds have the same. `None` if the user interrupted it.
+/// standardisation, and on nothing else: members of different seeds have the same. `clones` makes clones of the members of a buffer, with
+/// a rate each, for so many steps. `None` if the user interrupted it.
 ///
 /// # Errors
-/// If a checkpoint cannot be read or written.
-pub(super) fn chosen(
+/// Those of `clones`, and if a checkpoint cannot be read or written.
+pub(super) fn chosen<L: PolicyLearner>(
     buffer: &Buffer,
-    config: &BcConfig,
     steps: u64,
     place: Place<'_>,
     device: &Device,
+    clones: impl Fn(&Buffer, Vec<f64>, u64) -> Result<L, LearnError>,
 ) -> Result<Option<Vec<f64>>, LearnError> {
     let members = buffer.members();
+    // The metrics of these clones are not the members'.
+    let place = Place { journal: None, ..place };
+    let steps = STEPS.min(steps.div_ceil(12));
     let mut rates: Vec<f64> = Vec::with_capacity(members.len());
     for (m, member) in members.iter().enumerate() {
-        let same = |other: &&Member| {
+        let same = |other: &Member| {
             Arc::ptr_eq(&other.parts[0], &member.parts[0]) && other.standardizer == member.standardizer
         };
-        let rate = match members[..m].iter().position(|other| same(&other)) {
+        let rate = match members[..m].iter().position(same) {
             Some(earlier) => rates[earlier],
+            None if member.parts[0].len() < FEWEST => 0.0,
             None => {
-                let label = format!("clone dropout {m}");
-                let Some(rate) = of_member(member, buffer.batch(), config, steps, &label, place, device)? else {
+                let folds = Folds::of(member);
+                let rows = Buffer::new(folds.members, buffer.batch())?;
+                let mut learner = clones(&rows, folds.rates, steps)?;
+                if !prepare(&mut learner, &rows, steps, &format!("clone dropout {m}"), place, device)? {
                     return Ok(None);
-                };
-                rate
+                }
+                told(&learner.policies(), &folds.unseen)
             }
         };
         rates.push(rate);
@@ -139,103 +145,49 @@ pub(super) fn chosen(
     Ok(Some(rates))
 }
 
-fn of_member(
-    member: &Member,
-    batch: usize,
-    config: &BcConfig,
-    steps: u64,
-    label: &str,
-    place: Place<'_>,
-    device: &Device,
-) -> Result<Option<f64>, LearnError> {
-    let target = &member.parts[0];
-    if target.len() < FEWEST {
-        return Ok(Some(0.0));
-    }
-    let folds = fold_of_runs(target.len(), FOLDS);
-    let (mut clones, mut rates, mut unseen) = (Vec::new(), Vec::new(), Vec::new());
-    for fold in 0..FOLDS {
-        let (held_out, seen): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|&i| folds[i] == fold);
-        let seen = Arc::new(target.select(&seen));
-        unseen.push(target.select(&held_out));
-        for rate in [0.0, MUCH] {
-            // Both have the same weights at the start and the same batches.
-            let streams = Streams::new(fold as u64);
-            clones.push(Member { streams, parts: vec![seen.clone()], row_scores: None, ..member.clone() });
-            rates.push(rate);
+/// Two members for each fold of a member's target rows, without dropout and with it, and the rows that they do not see.
+struct Folds {
+    members: Vec<Member>,
+    rates: Vec<f64>,
+    unseen: Vec<Transitions>,
+}
+
+impl Folds {
+    fn of(member: &Member) -> Self {
+        let target = &member.parts[0];
+        let folds = fold_of_runs(target.len(), FOLDS);
+        let mut all = Self { members: Vec::new(), rates: Vec::new(), unseen: Vec::new() };
+        for fold in 0..FOLDS {
+            let (held_out, seen): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|&i| folds[i] == fold);
+            let seen = Arc::new(target.select(&seen));
+            all.unseen.push(target.select(&held_out));
+            for rate in [0.0, MUCH] {
+                // Both have the same weights at the start and the same batches.
+                let streams = Streams::new(fold as u64);
+                all.members.push(Member { streams, parts: vec![seen.clone()], row_scores: None, ..member.clone() });
+                all.rates.push(rate);
+            }
         }
+        all
     }
-    let rows = Buffer::new(clones, batch)?;
-    let steps = STEPS.min(steps.div_ceil(12));
-    let single = BcConfig { ensemble: 1, ..config.clone() };
-    let mut clones = Bc::with_dropout(&rows, &single, rates, steps, device)?;
-    if !prepare(&mut clones, &rows, steps, label, place, device)? {
-        return Ok(None);
-    }
+}
+
+/// What the policies of all folds, in pairs, say of the rows that they have not seen.
+fn told(policies: &[Policy], unseen: &[Transitions]) -> f64 {
     let mut squares = [0.0; 2];
-    for (k, policy) in clones.policies().iter().enumerate() {
-        let held_out = &unseen[k / 2];
-        let mut actions = vec![0.0; held_out.actions.len()];
-        policy.act(&held_out.observations, None, &mut actions);
-        squares[k % 2] += rmse(&actions, &held_out.actions).powi(2) * held_out.len() as f64;
+    for (k, policy) in policies.iter().enumerate() {
+        let rows = &unseen[k / 2];
+        let mut actions = vec![0.0; rows.actions.len()];
+        policy.act(&rows.observations, None, &mut actions);
+        squares[k % 2] += rmse(&actions, &rows.actions).powi(2) * rows.len() as f64;
     }
     let [without, with] = squares.map(f64::sqrt);
-    Ok(Some(if with < (1.0 - MARGIN) * without { MUCH } else { 0.0 }))
+    if with < (1.0 - MARGIN) * without { MUCH } else { 0.0 }
 }
 
 #[cfg(test)]
 mod tests {
-    use tce_base::random::fill_normal;
-    use tce_data::{Standardizer, Transitions};
-    use tce_nn::cpu;
-
     use super::*;
-
-    const WIDTH: usize = 8;
-
-    /// 600 rows of the action `of(state, noise)`.
-    fn rows(of: impl Fn(&[f32], f32) -> f32) -> Arc<Transitions> {
-        let mut t = Transitions::new(WIDTH, 1);
-        let (mut s, mut noise) = ([0.0; WIDTH], [0.0]);
-        let mut rng = Streams::new(3).stream("rows");
-        for _ in 0..600 {
-            fill_normal(&mut rng, &mut s);
-            fill_normal(&mut rng, &mut noise);
-            t.push(&s, &[of(&s, noise[0]).clamp(-1.0, 1.0)], 0.0, &s, false, false);
-        }
-        Arc::new(t)
-    }
-
-    fn member(seed: u64, rows: &Arc<Transitions>) -> Member {
-        Member {
-            streams: Streams::new(seed),
-            parts: vec![rows.clone()],
-            standardizer: Standardizer::identity(WIDTH),
-            reward_scale: 1.0,
-            row_scores: None,
-        }
-    }
-
-    #[test]
-    fn actions_that_the_state_does_not_tell_get_dropout_and_others_none() {
-        let noisy = rows(|_, noise| 0.4 * noise);
-        let exact = rows(|s, _| 0.5 * s[0]);
-        let of = |members: Vec<Member>| {
-            let buffer = Buffer::new(members, 64).unwrap();
-            chosen(&buffer, &BcConfig::default(), 12_000, Place::NONE, &cpu()).unwrap().unwrap()
-        };
-        let together = of(vec![member(1, &noisy), member(2, &exact), member(3, &noisy)]);
-        assert_eq!(together, [MUCH, 0.0, MUCH]);
-        assert_eq!(of(vec![member(9, &exact)]), [0.0], "whoever the other members are");
-    }
-
-    #[test]
-    fn few_rows_are_cloned_without_dropout() {
-        let few = Arc::new(rows(|_, noise| noise).select(&(0..200).collect::<Vec<_>>()));
-        let buffer = Buffer::new(vec![member(1, &few)], 64).unwrap();
-        let rates = chosen(&buffer, &BcConfig::default(), 12_000, Place::NONE, &cpu()).unwrap();
-        assert_eq!(rates, Some(vec![0.0]));
-    }
 
     #[test]
     fn the_key_is_a_share_or_a_word() {

@@ -13,8 +13,8 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, DropoutRate, LabelConfig, LearnError, Learner, Member, Method, Mode,
-    Place, Policy, PolicyLearner, best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, DropoutRate, LabelConfig, LearnError, Learner, Member, Meter, Method,
+    Mode, Place, Policy, PolicyLearner, Setup, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -131,6 +131,47 @@ fn dropout_keeps_a_clone_from_fitting_the_noise_of_its_rows() {
     };
     let (without, with) = (error(0.0), error(0.4));
     assert!(with > 1.1 * without && with < 0.35, "error at the rows: {without} without, {with} with");
+}
+
+/// 600 rows of the action `of(state, noise)`.
+fn rows_of(of: impl Fn(&[f32], f32) -> f32) -> Arc<Transitions> {
+    let mut t = Transitions::new(8, 1);
+    let (mut s, mut noise) = ([0.0; 8], [0.0]);
+    let mut rng = Streams::new(3).stream("rows");
+    for _ in 0..600 {
+        fill_normal(&mut rng, &mut s);
+        fill_normal(&mut rng, &mut noise);
+        t.push(&s, &[of(&s, noise[0]).clamp(-1.0, 1.0)], 0.0, &s, false, true);
+    }
+    Arc::new(t)
+}
+
+#[test]
+fn the_data_tell_whether_clones_take_dropout() {
+    let noisy = rows_of(|_, noise| 0.4 * noise);
+    let exact = rows_of(|s, _| 0.5 * s[0]);
+    let few = Arc::new(noisy.select(&(0..200).collect::<Vec<_>>()));
+    let config = BcConfig { dropout: DropoutRate::Auto, ..BcConfig::default() };
+    let chosen = |members: Vec<Member>| {
+        let (buffer, device) = (Buffer::new(members, 64).unwrap(), cpu());
+        let (iql, behaviour) = (IqlConfig::paper(), RegulariserConfig::paper());
+        let on = Setup {
+            buffer: &buffer,
+            steps: 12_000,
+            iql: &iql,
+            behaviour: &behaviour,
+            place: Place::NONE,
+            device: &device,
+        };
+        let mut learner = config.build(&on).unwrap().expect("nobody interrupts");
+        let mut meter = Meter::always();
+        learner.update(&buffer.sample(0, &device), 0, &mut meter);
+        meter.take()["dropout"].clone()
+    };
+    let all = chosen(vec![member(1, &noisy, true), member(2, &exact, true), member(3, &noisy, true)]);
+    assert_eq!(all, [0.3, 0.0, 0.3], "by the rows, whatever the seed");
+    assert_eq!(chosen(vec![member(9, &exact, true)]), [0.0], "whoever the other members are");
+    assert_eq!(chosen(vec![member(1, &few, true)]), [0.0], "too few rows to hold some out");
 }
 
 #[test]
