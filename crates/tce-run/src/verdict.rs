@@ -220,7 +220,10 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
         }
         _ => format!("{} is the only method there is.", name(chosen)),
     };
-    let support = |k: usize| mean_std(&estimates[k].iter().map(|j| j.support).collect::<Vec<_>>()).0;
+    let of_seeds = |k: usize, metric: &dyn Fn(&OffPolicyEstimate) -> f64| {
+        mean_std(&estimates[k].iter().map(metric).collect::<Vec<_>>()).0
+    };
+    let support = |k: usize| of_seeds(k, &|j| j.support);
     let known = next_best.map_or(1.0, |k| support(chosen).min(support(k)));
     let reason = match known < WHOLE {
         true => format!("{reason} Learned dynamics tell of the first {:.0} % of an episode only.", 100.0 * known),
@@ -228,9 +231,6 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
     };
     let seed = (0..estimates[chosen].len())
         .max_by(|&a, &b| estimates[chosen][a].supported_return.total_cmp(&estimates[chosen][b].supported_return));
-    let of_seeds = |k: usize, metric: &dyn Fn(&OffPolicyEstimate) -> f64| {
-        mean_std(&estimates[k].iter().map(metric).collect::<Vec<_>>()).0
-    };
     let tried = |k: usize| Tried {
         name: candidates[k].name.clone(),
         baseline: candidates[k].baseline,

@@ -83,17 +83,12 @@ impl Method for BcConfig {
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
-        let rates = match self.dropout {
-            DropoutRate::Share(share) => vec![share; on.buffer.members().len()],
-            DropoutRate::Auto => {
-                let single = BcConfig { ensemble: 1, ..self.clone() };
-                let clones = |rows: &Buffer, rates, steps| Bc::with_dropout(rows, &single, rates, steps, on.device);
-                match chosen(on.buffer, on.steps, on.place, on.device, clones)? {
-                    Some(rates) => rates,
-                    None => return Ok(None),
-                }
-            }
+        let DropoutRate::Auto = self.dropout else {
+            return Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)));
         };
+        let single = BcConfig { ensemble: 1, ..self.clone() };
+        let clones = |rows: &Buffer, rates, steps| Bc::with_dropout(rows, &single, rates, steps, on.device);
+        let Some(rates) = chosen(on.buffer, on.steps, on.place, on.device, clones)? else { return Ok(None) };
         Ok(Some(Box::new(Bc::with_dropout(on.buffer, self, rates, on.steps, on.device)?)))
     }
 
