@@ -12,8 +12,11 @@ from pathlib import Path
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "settings.md"
 HEAD = """# Settings
 
-Every key of the configuration. `scripts/settings.py` made this page from `tce config show`. Set one key with `--set KEY=VALUE`, several in a
-TOML file with `--config FILE`. `tce config show KEY` says the same in the terminal.
+Every key of the default preset. `scripts/settings.py` made this page from `tce config show`. Set one key with `--set KEY=VALUE`, several in a
+TOML file with `--config FILE`.
+
+A table with a `kind` has other keys for other kinds: `tce config show generator.process --preset paper`. The sign – says that a preset has another kind, without this key.
+`tce config show KEY` also explains each allowed word.
 """
 
 
@@ -26,6 +29,14 @@ def cell(value):
     return str(value if value is not None else "").replace("|", "\\|").replace("\n", " ").strip()
 
 
+def allowed(key):
+    """The range of a key's numbers, or its words; nothing where the type says all."""
+    if key["choices"]:
+        return ", ".join(f"`{word}`" for word, _ in key["choices"])
+    words = key["kind"] if '"' in key["kind"] else None
+    return key["range"] or words
+
+
 def page(program):
     tables = {}
     for entry in say(program):
@@ -34,11 +45,11 @@ def page(program):
         tables.setdefault(table, []).append(say(program, key))
     text = HEAD
     for table in sorted(tables):
-        text += f"\n## {table}\n\n| key | what it does | default | paper | quick | range | source |\n|---|---|---|---|---|---|---|\n"
+        text += f"\n## {table}\n\n| key | what it does | default | paper | quick | allowed | source |\n|---|---|---|---|---|---|---|\n"
         for one in tables[table]:
-            value = {k: f"`{v}`" for k, v in one["presets"]}
+            value = {k: "–" if v is None else f"`{v}`" for k, v in one["presets"]}
             cells = [f"`{one['key'].rpartition('.')[2]}`", one.get("what"), *(value.get(p) for p in ("default", "paper", "quick"))]
-            text += "| " + " | ".join(cell(c) for c in [*cells, one.get("range"), one.get("source")]) + " |\n"
+            text += "| " + " | ".join(cell(c) for c in [*cells, allowed(one), one.get("source")]) + " |\n"
     return text
 
 

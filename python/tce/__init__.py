@@ -62,7 +62,7 @@ def _register() -> None:
     for robot in ROBOTS:
         for shift in SHIFTS:
             name = f"tce/{robot}-{shift}-v0"
-            if name not in registry and (shift != "gravity5" or robot == "ant"):
+            if name not in registry and (shift != "gravity-5" or robot == "ant"):
                 register(id=name, entry_point="tce._gymnasium:RobotEnv", kwargs={"name": f"{robot}-{shift}"})
 
 

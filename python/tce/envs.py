@@ -17,7 +17,7 @@ from .errors import ConfigError
 from .policy import Policy
 
 ROBOTS = ("halfcheetah", "hopper", "walker2d", "ant")
-SHIFTS = ("source", "morph", "kinematic", "gravity", "gravity5")
+SHIFTS = ("source", "morph", "kinematic", "gravity", "gravity-5")
 
 #: What :func:`evaluate` takes as a policy: ours, or any function from an observation (d_s,) to an action (d_a,).
 PolicyLike = Union[Policy, Callable[[npt.NDArray[Any]], npt.ArrayLike]]

@@ -101,8 +101,9 @@ impl Augmenter {
             return Err(Error::Failed(format!("seeds: found {found}, expected {members}: one for each member")));
         }
         let streams: Vec<_> = seeds.iter().map(|&seed| Streams::new(seed)).collect();
-        let draw = Draw::new(&self.settings.generator.sampler, &streams, &self.target);
-        let (states, successors) = self.generator.sample_pairs(rows, y_max, self.support.as_ref(), &draw)?;
+        let support = self.support.as_ref();
+        let draw = Draw { support, ..Draw::new(&self.settings.generator.sampler, &streams, &self.target) };
+        let (states, successors) = self.generator.sample_pairs(rows, y_max, &draw)?;
         Ok(Pairs { states, successors, rows })
     }
 

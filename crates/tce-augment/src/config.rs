@@ -2,6 +2,7 @@
 //! sentence on what the key does, and behind `Source:` where its value is from, if it is the same for every preset.
 
 use serde::{Deserialize, Serialize};
+use tce_base::OrAuto;
 use tce_data::DensityOptions;
 use tce_diffusion::{Edm, Process, Sampler, Schedule, Target, UntilDone};
 use tce_learn::LabelConfig;
@@ -17,9 +18,9 @@ pub struct GeneratorConfig {
     /// What q_tran generates: the next state, or its difference from the state. Source: the paper has the next state.
     pub target: Target,
     /// Updates of q_mix, the network over states, or "auto": until it no longer helps (`generator.until_done`).
-    pub state_steps: Length,
+    pub state_steps: OrAuto<u64>,
     /// Updates of q_tran, the network from a state to the next one, or "auto": until it no longer helps (`generator.until_done`).
-    pub transition_steps: Length,
+    pub transition_steps: OrAuto<u64>,
     /// When training ends where a length is "auto".
     // Runs that were done before there was this table have fixed lengths.
     #[serde(default)]
@@ -56,8 +57,8 @@ impl GeneratorConfig {
             process: Process::Edm(Edm { sigma_max: 20.0, ..Edm::default() }),
             sampler: Sampler::SdeDpmSolver { steps: 20 },
             target: Target::Delta,
-            state_steps: Length::Auto,
-            transition_steps: Length::Auto,
+            state_steps: OrAuto::Auto,
+            transition_steps: OrAuto::Auto,
             until_done: UntilDoneConfig::default(),
             batch: 128,
             learning_rate: 1e-3,
@@ -72,67 +73,13 @@ impl GeneratorConfig {
     }
 }
 
-/// How long a score network is trained.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Length {
-    /// So many updates.
-    Steps(u64),
-    /// `"auto"`: until it no longer helps ([`UntilDoneConfig`]).
-    Auto,
-}
-
-impl Length {
-    /// The most updates that it can come to, where a training until it is done ends at `limit`.
-    pub fn most(self, limit: u64) -> u64 {
-        match self {
-            Length::Steps(steps) => steps,
-            Length::Auto => limit,
+impl GeneratorConfig {
+    /// How many rows are generated beside a share λ of so many source rows (Eq. 9).
+    pub fn rows_beside(&self, lambda: f64, source: usize) -> usize {
+        match self.rows {
+            0 => ((1.0 - lambda) * source as f64).round() as usize,
+            rows => rows,
         }
-    }
-}
-
-impl Serialize for Length {
-    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Length::Steps(steps) => to.serialize_u64(*steps),
-            Length::Auto => to.serialize_str("auto"),
-        }
-    }
-}
-
-impl schemars::JsonSchema for Length {
-    fn schema_name() -> std::borrow::Cow<'static, str> {
-        "Length".into()
-    }
-
-    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        schemars::json_schema!({ "anyOf": [{ "type": "integer", "minimum": 0 }, { "const": "auto" }] })
-    }
-}
-
-impl<'de> Deserialize<'de> for Length {
-    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        struct Visitor;
-        impl serde::de::Visitor<'_> for Visitor {
-            type Value = Length;
-            fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-                f.write_str("a number of updates, or \"auto\"")
-            }
-            fn visit_u64<E>(self, steps: u64) -> Result<Length, E> {
-                Ok(Length::Steps(steps))
-            }
-            fn visit_i64<E: serde::de::Error>(self, steps: i64) -> Result<Length, E> {
-                let negative = |_| E::invalid_value(serde::de::Unexpected::Signed(steps), &self);
-                u64::try_from(steps).map(Length::Steps).map_err(negative)
-            }
-            fn visit_str<E: serde::de::Error>(self, word: &str) -> Result<Length, E> {
-                match word {
-                    "auto" => Ok(Length::Auto),
-                    _ => Err(E::invalid_value(serde::de::Unexpected::Str(word), &self)),
-                }
-            }
-        }
-        from.deserialize_any(Visitor)
     }
 }
 
@@ -264,7 +211,7 @@ pub enum Terminal {
     None,
     /// The agent's own rule on ŝ'; where the agent is unknown, `learned`.
     Rule,
-    /// A classifier trained on the target rows.
+    /// A classifier trained on the target's and the source's rows. Without any terminal row: `none`.
     Learned,
 }
 

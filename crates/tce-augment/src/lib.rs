@@ -10,7 +10,7 @@
 //! | Checkpoints, metrics, chunks on disk? | the caller's: [`work::Keeper`] |
 //!
 //! ```
-//! use tce_augment::config::Length;
+//! use tce_base::OrAuto;
 //! use tce_augment::{Augmenter, Settings, Work, on_cpu};
 //! use tce_data::Transitions;
 //!
@@ -28,8 +28,8 @@
 //!
 //! // The recommended settings, cut short.
 //! let mut settings = Settings::recommended();
-//! settings.generator.state_steps = Length::Steps(20);
-//! settings.generator.transition_steps = Length::Steps(20);
+//! settings.generator.state_steps = OrAuto::Given(20);
+//! settings.generator.transition_steps = OrAuto::Given(20);
 //! settings.labels.training.steps = 20;
 //!
 //! let device = on_cpu();

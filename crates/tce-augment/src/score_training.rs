@@ -1,11 +1,11 @@
 //! Training of score networks, for a given length or until a criterion on held-out rows no longer falls.
 
-use tce_base::{Progress, Streams};
+use tce_base::{OrAuto, Progress, Streams};
 use tce_data::hold_out_runs;
 use tce_diffusion::{CycleEnd, Process, Sampler, ScoreData, ScoreModel, Trainer, UntilDone};
 use tce_nn::Checkpoints;
 
-use crate::config::{GeneratorConfig, Length};
+use crate::config::GeneratorConfig;
 use crate::error::Result;
 use crate::work::Keeper;
 
@@ -109,6 +109,6 @@ pub(crate) fn progress(label: &str, rows: usize, sampler: &Sampler) -> Progress 
 
 /// Of `n` target rows, those that the networks of `config` are trained on, and those that are held out to tell when to stop.
 pub fn held_out_rows(n: usize, config: &GeneratorConfig) -> (Vec<usize>, Vec<usize>) {
-    let auto = [config.state_steps, config.transition_steps].contains(&Length::Auto);
+    let auto = [config.state_steps, config.transition_steps].contains(&OrAuto::Auto);
     hold_out_runs(n, if auto { config.until_done.held_out } else { 0.0 })
 }

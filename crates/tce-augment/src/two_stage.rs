@@ -5,7 +5,7 @@
 //! contact slots) is left out and put back as the constant it is.
 
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
+use tce_base::{OrAuto, Streams};
 use tce_data::{Support, Transitions};
 use tce_diffusion::{
     Balance, Chunks, Condition, CycleEnd, DiffusionError, NetworkConfig, Part, Request, Sampler, ScoreData, ScoreModel,
@@ -14,7 +14,7 @@ use tce_diffusion::{
 use tce_learn::{LabelModels, rmse};
 use tce_nn::is_cpu;
 
-use crate::config::{GeneratorConfig, Length};
+use crate::config::GeneratorConfig;
 use crate::error::{Error, Result};
 use crate::score_training::{Course, Metrics, Ready, held_out_rows, progress, run, start_rows};
 use crate::units::Units;
@@ -60,12 +60,22 @@ pub struct Draw<'a> {
     pub target: &'a Transitions,
     /// Where sampled chunks are kept, if they are.
     pub kept: Option<Chunks<'a>>,
+    /// What drawn states and successors respect, if anything.
+    pub support: Option<&'a Support>,
 }
 
 impl<'a> Draw<'a> {
-    /// Nothing is kept.
+    /// Nothing is kept, nothing respected.
     pub fn new(sampler: &'a Sampler, members: &'a [Streams], target: &'a Transitions) -> Self {
-        Self { sampler, members, target, kept: None }
+        Self { sampler, members, target, kept: None, support: None }
+    }
+
+    /// Live `rows` within the support.
+    fn respected(&self, units: &Units, rows: Vec<f32>) -> Vec<f32> {
+        match self.support {
+            Some(support) => units.within(support, &rows),
+            None => rows,
+        }
     }
 }
 
@@ -106,12 +116,12 @@ impl Generator {
             Ok(metrics)
         };
         let state_course = match config.state_steps {
-            Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.state(), criterion: &state_losses },
+            OrAuto::Given(steps) => Course::Steps(steps),
+            OrAuto::Auto => Course::UntilDone { plan: config.until_done.state(), criterion: &state_losses },
         };
         let transition_course = match config.transition_steps {
-            Length::Steps(steps) => Course::Steps(steps),
-            Length::Auto => Course::UntilDone { plan: config.until_done.transition(), criterion: &successor_losses },
+            OrAuto::Given(steps) => Course::Steps(steps),
+            OrAuto::Auto => Course::UntilDone { plan: config.until_done.transition(), criterion: &successor_losses },
         };
         let (state, transition) =
             train_both([&state_data, &transition_data], [&state_course, &transition_course], config, work)?;
@@ -136,7 +146,7 @@ impl Generator {
     /// # Errors
     /// If the user interrupts, or a chunk cannot be kept.
     pub fn sample_states(&self, rows: usize, y_max: f32, draw: &Draw) -> Result<Vec<f32>> {
-        let Draw { sampler, members, target, kept } = *draw;
+        let Draw { sampler, members, target, kept, .. } = *draw;
         let labels: Vec<f32> = members.iter().flat_map(|m| uniform_labels(m, "state", rows, y_max)).collect();
         let d = self.units.live.len();
         let training = || self.units.states(&target.observations);
@@ -147,7 +157,7 @@ impl Generator {
         let mut states = self.state.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
         self.units.state.invert_in_place(&mut states);
-        Ok(states)
+        Ok(draw.respected(&self.units, states))
     }
 
     /// Samples a successor for every state (live dimensions, the data's units, `[P, rows, d]`).
@@ -155,7 +165,7 @@ impl Generator {
     /// # Errors
     /// As for [`Self::sample_states`].
     pub fn sample_successors(&self, states: &[f32], draw: &Draw) -> Result<Vec<f32>> {
-        let Draw { sampler, members, target, kept } = *draw;
+        let Draw { sampler, members, target, kept, .. } = *draw;
         let d = self.units.live.len();
         let rows = states.len() / (d * members.len());
         let condition = self.units.state.apply(states);
@@ -166,29 +176,17 @@ impl Generator {
             Request { name: "successor", rows, condition: &condition, guidance: None, start: start.as_deref(), kept };
         let mut out = self.transition.sample(request, sampler, members, Some(&progress))?;
         progress.finish();
-        self.units.output.invert_in_place(&mut out);
-        self.units.target.decode(states, &mut out);
-        Ok(out)
+        self.units.successors(states, &mut out);
+        Ok(draw.respected(&self.units, out))
     }
 
-    /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, `y_max`) and their successors, both
-    /// within the `support`.
+    /// State pairs `[P, rows, d]` (live dimensions, the data's units): states under ŷ ~ U(0, `y_max`) and their successors.
     ///
     /// # Errors
     /// As for [`Self::sample_states`].
-    pub fn sample_pairs(
-        &self,
-        rows: usize,
-        y_max: f32,
-        support: Option<&Support>,
-        draw: &Draw,
-    ) -> Result<(Vec<f32>, Vec<f32>)> {
-        let respect = |rows: Vec<f32>| match support {
-            Some(support) => self.units.within(support, &rows),
-            None => rows,
-        };
-        let states = respect(self.sample_states(rows, y_max, draw)?);
-        let successors = respect(self.sample_successors(&states, draw)?);
+    pub fn sample_pairs(&self, rows: usize, y_max: f32, draw: &Draw) -> Result<(Vec<f32>, Vec<f32>)> {
+        let states = self.sample_states(rows, y_max, draw)?;
+        let successors = self.sample_successors(&states, draw)?;
         Ok((states, successors))
     }
 }
@@ -331,10 +329,9 @@ fn implied_errors(
         kept: None,
     };
     let mut out = model.sample(request, sampler, &streams, None)?;
-    units.output.invert_in_place(&mut out);
     let (whole, own) = (rows.observations.repeat(PROBE_DRAWS), rows.actions.repeat(PROBE_DRAWS));
     let error = |(m, out): (usize, &mut [f32])| {
-        units.target.decode(&states, out);
+        units.successors(&states, out);
         Ok(rmse(&models.actions(m, &whole, &units.put_back(out))?, &own))
     };
     out.chunks_exact_mut(n * d).enumerate().map(error).collect()

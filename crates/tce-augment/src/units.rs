@@ -67,6 +67,14 @@ impl Units {
         self.output.apply(&self.target.encode(&s, &s2))
     }
 
+    /// The successors of live `states`, in place, from what q_tran generates, both `[n, d]`. A column that no step of the target changes
+    /// keeps its value: a generative model leaves noise there.
+    pub fn successors(&self, states: &[f32], generated: &mut [f32]) {
+        self.output.invert_in_place(generated);
+        self.output.restore_dead(generated);
+        self.target.decode(states, generated);
+    }
+
     /// Live dimensions of states that respect what the data respect.
     pub fn within(&self, support: &Support, live: &[f32]) -> Vec<f32> {
         let mut whole = self.put_back(live);
@@ -98,6 +106,25 @@ mod tests {
         let standardised = units.states(&t.observations);
         let mean: f32 = standardised.iter().sum::<f32>() / standardised.len() as f32;
         assert!(mean.abs() < 1e-6);
+    }
+
+    #[test]
+    fn what_no_step_changes_stays_what_it_is() {
+        // The goal of an episode, in metres.
+        let mut t = Transitions::new(2, 1);
+        (0..20).for_each(|i| {
+            let (x, goal) = (i as f32, if i < 10 { 0.001 } else { 0.002 });
+            t.push(&[x, goal], &[0.0], 0.0, &[x + (i % 3) as f32, goal], false, i == 9);
+        });
+        let units = Units::fit(&t, None, Target::Delta);
+        assert_eq!(units.live, [0, 1]);
+        // The networks leave an error in both columns.
+        let mut generated: Vec<f32> = units.outputs(&t).iter().map(|x| x + 1e-3).collect();
+        units.successors(&t.observations, &mut generated);
+        for (found, real) in generated.chunks_exact(2).zip(t.next_observations.chunks_exact(2)) {
+            assert!((found[0] - real[0]).abs() < 2e-3 && found[0] != real[0], "{found:?} {real:?}");
+            assert_eq!(found[1], real[1]);
+        }
     }
 
     #[test]

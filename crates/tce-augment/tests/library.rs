@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use rand::RngExt;
-use tce_augment::config::{FilterConfig, Length, SingleStageConfig};
+use tce_augment::config::{FilterConfig, SingleStageConfig};
 use tce_augment::single_stage::SingleStage;
 use tce_augment::{Augmenter, Settings, Work, on_cpu};
-use tce_base::Streams;
+use tce_base::{OrAuto, Streams};
 use tce_data::Transitions;
 use tce_diffusion::Sampler;
 
@@ -24,8 +24,8 @@ fn walk(gain: f32, rows: usize, seed: u64) -> Transitions {
 
 fn short() -> Settings {
     let mut settings = Settings::recommended();
-    settings.generator.state_steps = Length::Steps(30);
-    settings.generator.transition_steps = Length::Steps(30);
+    settings.generator.state_steps = OrAuto::Given(30);
+    settings.generator.transition_steps = OrAuto::Given(30);
     settings.generator.sampler = Sampler::SdeDpmSolver { steps: 4 };
     settings.labels.training.steps = 30;
     settings

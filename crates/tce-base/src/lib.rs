@@ -16,6 +16,7 @@
 //! assert_ne!(draw(7, "resets"), draw(8, "resets"));
 //! ```
 
+pub mod auto;
 pub mod checked;
 pub mod course;
 pub mod files;
@@ -32,6 +33,7 @@ pub mod terminal;
 pub mod words;
 pub mod wrap;
 
+pub use auto::OrAuto;
 pub use checked::{Damage, JsonError, first_damaged, read_json, sha256_files, verify_sha256};
 pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
 pub use files::{
@@ -45,7 +47,7 @@ pub use progress::{Progress, Running, running};
 pub use random::{Rng, Streams};
 pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
-pub use statistics::{mean_std, plus_minus};
+pub use statistics::{mean_and_error, mean_std, plus_minus};
 pub use terminal::{set_listener, set_quiet};
 pub use words::{did_you_mean, file_inside, nearest};
 

@@ -25,7 +25,8 @@ pub fn hold_out_runs(n: usize, share: f64) -> (Vec<usize>, Vec<usize>) {
     // Of a single run one half would be held out from the other.
     let length = if n > HELD_OUT_RUN { HELD_OUT_RUN } else { n.div_ceil(2).max(1) };
     let runs = n.div_ceil(length);
-    let count = ((runs as f64 * share).round() as usize).clamp(usize::from(share > 0.0), runs.saturating_sub(1));
+    // One run at least, if any; never all of them.
+    let count = ((runs as f64 * share).round() as usize).max(usize::from(share > 0.0)).min(runs.saturating_sub(1));
     let chosen = choose(&mut Streams::new(0).stream("held out runs"), runs, count);
     (0..n).partition(|i| chosen.binary_search(&(i / length)).is_err())
 }
@@ -45,6 +46,8 @@ mod tests {
         assert_eq!(hold_out_runs(100, 0.0), ((0..100).collect(), vec![]));
         let (kept, held_out) = hold_out_runs(60, 0.01);
         assert!(!held_out.is_empty() && kept.len() >= 35, "at least one run, never all");
+        assert_eq!(hold_out_runs(1, 0.05), (vec![0], vec![]));
+        assert_eq!(hold_out_runs(0, 0.05), (vec![], vec![]));
     }
 
     #[test]

@@ -38,7 +38,7 @@ pub fn augment(
     let (source, target) = (source.rows.clone(), target.rows.clone());
     let augmented = attended(py, progress, move || {
         tce_base::ensure_folder(&cache)?;
-        let inputs = Inputs::of_rows(Some(source), target, None, &own)?.with_target_rows(config.target.rows);
+        let inputs = Inputs::of_rows(Some(source), target, None, &own)?.with_target_rows(config.target.rows)?;
         Augmented::new(&inputs, &config, seed, &cache, &device)
     })?;
     let report = serde_json::json!({ "report": augmented.report, "attributes": augmented.attributes });

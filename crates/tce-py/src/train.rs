@@ -52,7 +52,7 @@ pub fn train(
         tce_base::ensure_folder(&out)?;
         let extra = extra.as_ref().map(|(rows, origin)| (rows.clone(), origin.as_deref()));
         let inputs = Inputs::of_rows(source, target, extra, &own)?;
-        let inputs = inputs.with_target_rows(config.target.rows);
+        let inputs = inputs.with_target_rows(config.target.rows)?;
         let run = TrainingRun { config: &config, seeds: &seeds, own: &own, comparison, out: &out };
         run.run(&inputs, &device)
     })?;

@@ -203,6 +203,22 @@ pub struct EvaluationConfig {
     pub scores: ScoreTable,
 }
 
+/// Refuses layers without units, anywhere below the key `path`. Every network has its `hidden` layers; one rule serves all of them.
+fn ensure_layers(path: &str, value: &serde_json::Value) -> Result<()> {
+    let Some(table) = value.as_object() else { return Ok(()) };
+    for (key, value) in table {
+        let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+        let widths = value.as_array().map_or(std::slice::from_ref(value), Vec::as_slice);
+        if key == "hidden" && widths.contains(&0.into()) {
+            return Err(Error::Usage(format!(
+                "key `{path}`: found {value}, expected layers of at least one unit each"
+            )));
+        }
+        ensure_layers(&path, value)?;
+    }
+    Ok(())
+}
+
 impl Config {
     /// The ranges that types cannot express.
     pub fn validate(&self) -> Result<()> {
@@ -277,6 +293,7 @@ impl Config {
                     .into(),
             ));
         }
+        ensure_layers("", &serde_json::json!(Named::from(self)))?;
         self.generator.process.check().map_err(|e| Error::Usage(format!("generator.process: {e}")))?;
         self.generator.sampler.check().map_err(|e| Error::Usage(format!("generator.sampler: {e}")))?;
         self.learner.check()

@@ -6,8 +6,7 @@
 use std::path::Path;
 
 use serde_json::{Value, json};
-use tce_augment::config::Length;
-use tce_base::{Step, plan_course, sha256_hex};
+use tce_base::{OrAuto, Step, plan_course, sha256_hex};
 use tce_learn::LearnedRows;
 use tce_nn::Device;
 
@@ -68,7 +67,7 @@ impl<'a> Course<'a> {
                     g.source_states
                 ]);
                 // Label models decide when q_tran is done, so that they are trained first.
-                if g.transition_steps == Length::Auto {
+                if g.transition_steps == OrAuto::Auto {
                     self.step("label models", labels);
                     self.step("score networks", networks);
                 } else {

@@ -18,7 +18,7 @@ pub use crate::tables::{Behaviour, Table};
 pub use crate::task_data::{Actors, DataArgs, d4rl_recipe, ensure_data, source_file, target_file};
 
 /// Source and target, and what is known about where they come from.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Inputs {
     /// The robot, where it is one of the benchmark's.
     pub agent: Option<Agent>,
@@ -195,7 +195,16 @@ impl Inputs {
     /// [`Inputs::of_task`] as `config` wants them: without source rows if it has no use for them, with as many target rows as it says.
     pub fn of_config(task: Task, args: &DataArgs, config: &Config) -> Result<Self> {
         let rows = config.needs_source().then_some(config.source.rows);
-        Ok(Self::of_task(task, args, rows)?.with_target_rows(config.target.rows))
+        Self::of_task(task, args, rows)?.with_target_rows(config.target.rows)
+    }
+
+    /// What `config` looks at: without the source if it has no use for one. What is not in a cache key must not decide anything: one call's
+    /// inputs serve several configurations.
+    pub fn seen_by(&self, config: &Config) -> Cow<'_, Self> {
+        match config.needs_source() || self.source.is_none() {
+            true => Cow::Borrowed(self),
+            false => Cow::Owned(Self { source: None, ..self.clone() }),
+        }
     }
 
     /// The same with other target rows, of which `hash` tells what they are.
@@ -210,10 +219,15 @@ impl Inputs {
     }
 
     /// The first `rows` target rows alone, as if the log had ended there; 0, or more than there are, means all of them.
-    pub fn with_target_rows(self, rows: usize) -> Self {
-        let Some(first) = first_rows(self.target.complete(), rows) else { return self };
+    ///
+    /// # Errors
+    /// If nothing can be learned of so few.
+    pub fn with_target_rows(self, rows: usize) -> Result<Self> {
+        let Some(first) = first_rows(self.target.complete(), rows) else { return Ok(self) };
         let hash = format!("{}, the first {rows} rows", self.target.hash);
-        self.with_target(first, hash)
+        let inputs = self.with_target(first, hash);
+        inputs.target.usable().map_err(|error| Error::Usage(format!("target.rows = {rows}: {error}")))?;
+        Ok(inputs)
     }
 
     /// The trajectories to imitate, where `config` wants the better ones and the returns show two behaviours; None: all of them.
@@ -259,6 +273,15 @@ impl Inputs {
         }
     }
 
+    /// The target rows that the learner of `config` learns from: models of the dynamics cannot use a terminal row without a successor.
+    pub fn taught(&self, config: &Config) -> Arc<Transitions> {
+        let rows = match config.learner.algorithm.about().successors {
+            true => self.imitated(&config.target),
+            false => self.learned_from(&config.target),
+        };
+        Arc::new(rows.into_owned())
+    }
+
     /// [`Inputs::spec`] of work that sees the imitated rows alone.
     pub fn spec_imitated(&self, domains: Domains, config: &TargetConfig) -> InputSpec {
         let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
@@ -281,9 +304,24 @@ impl Inputs {
                 );
             }
         }
+        self.note_lost_terminals();
         self.refuse_mixed_up()?;
         self.bring_into_the_box(own)?;
         Ok(self)
+    }
+
+    /// Tells of logs without a next state wherever an episode ends: models cannot learn from them how episodes end.
+    fn note_lost_terminals(&self) {
+        let tables = || std::iter::once(&self.target).chain(&self.source);
+        let terminal = |t: &Transitions| t.terminals.iter().filter(|&&t| t).count();
+        let all: usize = tables().map(|t| terminal(t.complete())).sum();
+        let known: usize = tables().map(|t| terminal(&t.rows)).sum();
+        if self.agent.is_none() && all > 0 && known == 0 {
+            tce_base::note!(
+                "warning: {all} rows are terminal, and none of them has a next state: no generated or imagined episode will end early. \
+                 Record the state in which an episode ends as `next_observations`"
+            );
+        }
     }
 
     /// Refuses a source that is the target, and warns of one that is smaller: files get mixed up.
@@ -347,9 +385,14 @@ impl Inputs {
     /// How good the policies were that collected the source and the target rows.
     pub fn behaviour(&self, table: ScoreTable) -> (Option<Behaviour>, Behaviour) {
         let of_source = self.agent.and_then(|agent| reference_scores(agent, Shift::Source, table));
-        let limit = self.limit.or(self.agent.map(|_| EPISODE_LIMIT));
+        let limit = self.step_limit();
         let source = self.source.as_ref().map(|s| s.behaviour(of_source, limit));
         (source, self.target.behaviour(self.reference(table), limit))
+    }
+
+    /// The steps after which an episode is cut, where that is known: the user said it, or the robot is one of the benchmark's.
+    pub fn step_limit(&self) -> Option<usize> {
+        self.limit.or(self.agent.map(|_| EPISODE_LIMIT))
     }
 
     /// The returns that stand for 0 and 100 in the target domain.
@@ -365,24 +408,27 @@ mod tests {
     #[test]
     fn fewer_target_rows_are_as_if_the_log_had_ended() {
         let mut t = Transitions::new(1, 1);
-        (0..10).for_each(|i| t.push(&[i as f32], &[0.0], i as f32, &[i as f32 + 1.0], i == 4, i == 9));
+        (0..30).for_each(|i| t.push(&[i as f32], &[0.0], i as f32, &[i as f32 + 1.0], i == 14, i == 29));
         let table = |rows: &Transitions| Table::new(rows.clone(), Path::new("t.hdf5"), "h".into());
-        let inputs = |rows: usize| {
+        let shortened = |rows: usize| {
             let (target, source) = (table(&t), Some(table(&t)));
             let all = Inputs { agent: None, shift: None, target, source, extra: None, actions: None, limit: None };
             all.with_target_rows(rows)
         };
-        let few = inputs(7);
-        assert_eq!(few.target.rows.rewards, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        assert_eq!(few.target.rows.episodes().iter().map(|e| e.end).collect::<Vec<_>>(), [5, 7]);
-        assert!(few.target.rows.timeouts[6] && !few.target.rows.terminals[6]);
-        assert_eq!(few.target.hash, "h, the first 7 rows");
+        let inputs = |rows: usize| shortened(rows).unwrap();
+        let few = inputs(17);
+        assert_eq!(few.target.rows.rewards, (0..17).map(|i| i as f32).collect::<Vec<_>>());
+        assert_eq!(few.target.rows.episodes().iter().map(|e| e.end).collect::<Vec<_>>(), [15, 17]);
+        assert!(few.target.rows.timeouts[16] && !few.target.rows.terminals[16]);
+        assert_eq!(few.target.hash, "h, the first 17 rows");
         // An episode that is over is not cut off.
-        let ended = inputs(5).target.rows;
-        assert!(ended.terminals[4] && !ended.timeouts[4]);
-        for rows in [0, 10, 11] {
-            assert_eq!((inputs(rows).target.rows.len(), inputs(rows).target.hash.as_str()), (10, "h"), "{rows}");
+        let ended = inputs(15).target.rows;
+        assert!(ended.terminals[14] && !ended.timeouts[14]);
+        for rows in [0, 30, 31] {
+            assert_eq!((inputs(rows).target.rows.len(), inputs(rows).target.hash.as_str()), (30, "h"), "{rows}");
         }
-        assert_eq!(few.source.unwrap().rows.len(), 10, "the source stays");
+        assert_eq!(few.source.unwrap().rows.len(), 30, "the source stays");
+        let refused = shortened(3).unwrap_err().to_string();
+        assert!(refused.starts_with("target.rows = 3: ") && refused.contains("expected at least 10"), "{refused}");
     }
 }

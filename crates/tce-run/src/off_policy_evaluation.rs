@@ -25,7 +25,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::{Streams, mean_std, sha256_hex};
+use tce_base::{Streams, mean_and_error, mean_std, sha256_hex};
 use tce_data::{
     ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, hold_out_runs, nn_distances,
 };
@@ -65,6 +65,8 @@ pub struct OffPolicyEvaluator {
     low: Vec<f32>,
     high: Vec<f32>,
     limit: usize,
+    /// Whether `limit` is the length of an episode.
+    whole: bool,
     /// The units of the policies' actions, where they are not the box.
     actions: Option<ActionRange>,
     spacing: f64,
@@ -133,20 +135,22 @@ impl OffPolicyEvaluator {
         };
         let tables: Vec<&Transitions> = std::iter::once(&**target).chain(source.as_deref()).collect();
         let (low, high) = bounds(&tables);
-        let episodes = target.episodes();
-        let limit = episodes.iter().map(|e| e.end - e.start).max().unwrap_or(1);
+        let longest = target.episodes().iter().map(|e| e.end - e.start).max().unwrap_or(1);
+        // Rows in no order do not tell how long an episode is.
+        let limit = if inputs.target.has_episodes() { Some(longest) } else { inputs.step_limit() };
         Ok(Self {
             dynamics,
             held_out,
             stage,
             root: root.to_owned(),
             inputs: inputs.spec(Domains::Target),
-            spacing: spacing(target),
+            spacing: spacing(target)?,
             worst: worst_reward(target),
             target: target.clone(),
             low,
             high,
-            limit,
+            limit: limit.unwrap_or(longest),
+            whole: limit.is_some(),
             actions: inputs.actions.clone(),
         })
     }
@@ -156,6 +160,14 @@ impl OffPolicyEvaluator {
         let threshold = margin * self.held_out_error(0.95);
         let errors = self.dynamics.errors(rows, Domain::Target);
         (0..rows.len()).filter(|&i| errors[i] <= threshold).collect()
+    }
+
+    /// Why no estimate can be relied on, if so.
+    pub fn doubt(&self) -> Option<String> {
+        let steps = if self.limit == 1 { "one step".to_owned() } else { format!("{} steps", self.limit) };
+        (!self.whole).then(|| {
+            format!("The target's rows are in no order, so that policies are tried for {steps} only: give --step-limit N, the length of an episode.")
+        })
     }
 
     /// A quantile of the errors on held-out target rows, in steps.
@@ -222,7 +234,7 @@ impl OffPolicyEvaluator {
                 }
             }
         }
-        let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t)? };
+        let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t, &spreads(t))? };
         let (returns, steps) = (returns.concat(), steps.concat());
         let left = self.left(left, &distances, &passed);
         let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(self.worst, self.limit));
@@ -230,11 +242,11 @@ impl OffPolicyEvaluator {
         let known: usize = steps.iter().zip(&left).map(|(&all, left)| left.map_or(all, |l| l.steps)).sum();
         let n = returns.len() as f64;
         let share = |steps: usize| steps as f64 / (n * self.limit as f64);
-        let (mean, std) = mean_std(&returns);
+        let (mean, error) = mean_and_error(&returns);
         let actions = self.actions_at(policy, &t.observations);
         Ok(OffPolicyEstimate {
             imagined_return: mean,
-            standard_error: std / n.sqrt(),
+            standard_error: error,
             supported_return: mean_std(&supported).0,
             survival: share(steps.iter().sum()),
             support: share(known),
@@ -365,9 +377,13 @@ fn bounds(tables: &[&Transitions]) -> (Vec<f32>, Vec<f32>) {
     (low, high)
 }
 
-/// Distance of every state of `rows` to the nearest state of `target`, in spreads of the target's columns.
-fn distances(rows: &Transitions, target: &Transitions) -> Result<Vec<f32>> {
-    let scale = Standardizer::fit(&target.observations, target.obs_dim);
+/// The spreads of a target's columns, in which distances are measured.
+fn spreads(target: &Transitions) -> Standardizer {
+    Standardizer::fit(&target.observations, target.obs_dim)
+}
+
+/// Distance of every state of `rows` to the nearest state of `target`, in spreads of columns.
+fn distances(rows: &Transitions, target: &Transitions, scale: &Standardizer) -> Result<Vec<f32>> {
     let of = |t: &Transitions| scale.apply(&t.observations);
     let (rows, target) = (of(rows), of(target));
     let width = scale.dim();
@@ -379,21 +395,61 @@ fn median(mut values: Vec<f32>) -> f64 {
     values.get(values.len() / 2).map_or(f64::NAN, |&v| f64::from(v))
 }
 
-/// The median distance between a target state and the nearest one of another episode; of the other half, where there is one episode.
-fn spacing(target: &Transitions) -> f64 {
-    let episodes = target.episodes();
-    let last = episodes.last().map_or(0, |e| e.start);
-    let cut = if last > 0 { last } else { target.len() / 2 };
-    let (rest, one): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|&i| i < cut);
-    match distances(&target.select(&one), &target.select(&rest)) {
-        Ok(distances) => median(distances).max(1e-6),
-        Err(_) => 1.0,
+/// Parts of the target whose distance from the rest is measured.
+const PARTS: usize = 8;
+
+/// The median distance between a target state and the nearest one of another episode, or of another eighth of the episodes where there are
+/// more than eight; of the other half, where there is one episode.
+fn spacing(target: &Transitions) -> Result<f64> {
+    let starts: Vec<usize> = target.episodes().iter().map(|e| e.start).collect();
+    let parts = starts.len().min(PARTS);
+    let cuts: Vec<usize> = match parts {
+        0 | 1 => vec![0, target.len() / 2],
+        _ => (0..parts).map(|k| starts[k * starts.len() / parts]).collect(),
+    };
+    let scale = spreads(target);
+    let mut all = Vec::with_capacity(target.len());
+    for (k, &cut) in cuts.iter().enumerate() {
+        let end = cuts.get(k + 1).copied().unwrap_or(target.len());
+        let (one, rest): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|i| (cut..end).contains(i));
+        if !one.is_empty() && !rest.is_empty() {
+            all.extend(distances(&target.select(&one), &target.select(&rest), &scale)?);
+        }
     }
+    Ok(if all.is_empty() { 1.0 } else { median(all).max(1e-6) })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Episodes of so many rows along a line; each is `apart` from the one before, in the second column.
+    fn episodes(lengths: &[usize], apart: f32) -> Transitions {
+        let mut t = Transitions::new(2, 1);
+        for (k, &length) in lengths.iter().enumerate() {
+            for i in 0..length {
+                let x = 100.0 * i as f32 / length as f32;
+                t.push(&[x, k as f32 * apart], &[0.0], 0.0, &[x, k as f32 * apart], false, i + 1 == length);
+            }
+        }
+        t
+    }
+
+    #[test]
+    fn the_spacing_of_a_target_is_that_of_all_of_its_episodes() {
+        let usual = spacing(&episodes(&[200; 5], 1.0)).unwrap();
+        // A last episode that was stopped at once stands where the others do; it decides nothing.
+        let stopped = spacing(&episodes(&[200, 200, 200, 200, 200, 1], 1.0)).unwrap();
+        assert!((stopped / usual - 1.0).abs() < 0.25, "{usual} {stopped}");
+        // A column that is constant in an episode counts in spreads, whatever its unit.
+        let (near, far) = (spacing(&episodes(&[200; 2], 0.1)).unwrap(), spacing(&episodes(&[200; 2], 1e3)).unwrap());
+        assert!((near / far - 1.0).abs() < 1e-3 && near > 0.5, "{near} {far}");
+        // Of one episode, its halves; of a single row, nothing.
+        assert!(spacing(&episodes(&[200], 1.0)).unwrap() > 0.1);
+        assert_eq!(spacing(&episodes(&[1], 1.0)).unwrap(), 1.0);
+        // Many short episodes are taken together.
+        assert!(spacing(&episodes(&[3; 300], 0.01)).unwrap() > 0.0);
+    }
 
     #[test]
     fn leaving_the_data_early_never_pays() {

@@ -156,6 +156,7 @@ pub fn run(
     device: &Device,
 ) -> Result<Summary> {
     inputs.ensure_episodes(&config.learner)?;
+    let inputs = &*inputs.seen_by(config);
     let generated = config.mixture.generated != GeneratedRows::None;
     let relabelled = config.mixture.source == SourceRows::Relabelled;
     let spec = RunSpec::new(inputs, config, seeds);
@@ -195,7 +196,8 @@ pub fn run(
     drop(extra);
     let place = (attempt.directory(), attempt.key());
     tce_base::begin_step(&crate::course::training_step(name));
-    let learned = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
+    // The end of the attempt removes what the training leaves.
+    let (learned, _) = learn(data, &config.learner, &config.evaluation, arena, place, device, |policies| {
         save_policies(policies, seeds, attempt.directory(), inputs)?;
         files.extend(seeds.iter().map(|&seed| policy_file(seed)));
         Ok(())
@@ -225,12 +227,7 @@ pub fn run(
 
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
-    // Models of the dynamics cannot use a terminal row without a successor.
-    let target = match config.learner.algorithm.about().successors {
-        true => inputs.imitated(&config.target),
-        false => inputs.learned_from(&config.target),
-    };
-    let target = Arc::new(target.into_owned());
+    let target = inputs.taught(config);
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
         // Generated rows are no trajectories.

@@ -13,7 +13,7 @@ use tce_learn::{
     Buffer, Journal, LearnedRows, Member, Place, Policy, PolicyLearner, Report, RewardScale, Steps, TrainingJob,
     best_trajectories, return_range_scale, train_side_by_side,
 };
-use tce_nn::{Device, is_cpu};
+use tce_nn::{Checkpoints, Device, is_cpu};
 use tce_sim::SimError;
 use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 
@@ -75,18 +75,33 @@ impl Learned {
     }
 }
 
+/// What a finished training needs until its results are on disk.
+#[must_use]
+pub struct Leftovers<'a> {
+    checkpoints: Checkpoints,
+    place: Place<'a>,
+}
+
+impl Leftovers<'_> {
+    /// Removes the checkpoints. Call it when the results are on disk: an interruption before that costs no training.
+    pub fn discard(self) {
+        self.checkpoints.remove();
+        self.place.discard_preparations();
+    }
+}
+
 /// Learns one policy per member. On the CPU members are trained side by side, elsewhere as one population: a member's
 /// policy is the same, up to the rounding of the device. Metrics and checkpoints are kept in a directory, beside a cache key: the hash of all inputs. `keep` gets the policies before they are evaluated, so that what hours of training gave is on disk
 /// whatever happens then.
-pub fn learn(
+pub fn learn<'a>(
     data: Vec<MemberData>,
     config: &LearnerConfig,
     evaluation: &EvaluationConfig,
     arena: Option<Arena>,
-    (directory, key): (&Path, &str),
+    (directory, key): (&'a Path, &'a str),
     device: &Device,
     keep: impl FnOnce(&[Policy]) -> Result<()>,
-) -> Result<Learned> {
+) -> Result<(Learned, Leftovers<'a>)> {
     let started = std::time::Instant::now();
     let rows = LearnedRows::with(data.iter().find_map(|d| d.extra.as_ref()));
     let config = &LearnerConfig { steps: config.steps(rows), ..config.clone() };
@@ -148,9 +163,9 @@ pub fn learn(
         }
     }
     learned.seconds = started.elapsed().as_secs_f64();
-    checkpoints.remove();
-    place.discard_preparations();
-    Ok(learned)
+    // Its metrics are written.
+    let place = Place { directory: Some(directory), key, job: 0, journal: None };
+    Ok((learned, Leftovers { checkpoints, place }))
 }
 
 /// A report of `stage` on members `first` and following.

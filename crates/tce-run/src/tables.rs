@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 const LEAST_ROWS: usize = 10;
 
 /// A loaded file.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Table {
     /// The rows whose successor is known.
     pub rows: Arc<Transitions>,

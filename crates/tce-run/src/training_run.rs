@@ -7,14 +7,16 @@
 //! | `verdict.json` | why it is recommended |
 //! | `baseline/` | the clones of the target rows, where the policies learned from more than those |
 //! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | metrics, settings, inputs of the key, results |
+//! | `learned.json` | that a training came to its end, here and in `baseline/` |
 //!
-//! A second call with the same directory returns the finished run, or resumes from its checkpoints.
+//! A second call with the same directory returns the finished run, or does what is missing: finished trainings are not done again, others
+//! go on from their checkpoints. Paths in files are relative to the directory, which can be moved.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use tce_base::{read_if_there, sha256_hex};
+use tce_base::{first_damaged, read_if_there, read_json, sha256_files, sha256_hex, write_json};
 use tce_data::ScoreTable;
 use tce_learn::{LearnedRows, OtherRows};
 use tce_nn::Device;
@@ -28,7 +30,7 @@ use crate::inputs::{Inputs, Table};
 use crate::methods::row_scores;
 use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
-use crate::policy_training::{Learned, MemberData, learn, save_policies};
+use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::verdict::{Candidate, Kept, keep, only, recommend};
 
 /// The name of the baseline: clones of the target rows alone.
@@ -73,6 +75,39 @@ pub struct Trained {
     pub verdict: Option<Kept>,
 }
 
+impl Trained {
+    /// The same with other paths.
+    fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> Self {
+        self.policies.iter_mut().for_each(|p| *p = path(p));
+        if let Some(kept) = &mut self.verdict {
+            kept.file = path(&kept.file);
+            kept.verdict.policy = path(&kept.verdict.policy);
+        }
+        self
+    }
+}
+
+/// The name of the file that says that a training came to its end.
+const LEARNED: &str = "learned.json";
+
+/// Its content.
+#[derive(Serialize, Deserialize)]
+struct Done {
+    /// Hash of all inputs of the training.
+    key: String,
+    /// SHA-256 of every policy.
+    policies: BTreeMap<String, String>,
+    learned: Learned,
+}
+
+impl Done {
+    /// The end of the training `key` in `directory`; None if it has to be started or resumed.
+    fn read(directory: &Path, key: &str) -> Result<Option<Self>> {
+        let done: Option<Self> = read_json(&directory.join(LEARNED), "remove it to train again")?;
+        Ok(done.filter(|d| d.key == key && first_damaged(directory, &d.policies).is_none()))
+    }
+}
+
 /// Refuses options that `learner` has no use for, and a training without other `rows` that it needs.
 ///
 /// # Errors
@@ -105,24 +140,19 @@ impl TrainingRun<'_> {
         let (out, seeds) = (self.out, self.seeds);
         let method = self.config.learner.algorithm.about();
         let spec = self.spec(inputs, device);
-        let key = sha256_hex(spec.to_string().as_bytes());
-        if let Some(trained) = found(out, &spec)? {
+        let key = sha256_hex(without_source(&spec).to_string().as_bytes());
+        if let Some(trained) = found(out, &spec, self.comparison)? {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
         }
         let data = self.members(inputs)?;
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
-        tce_base::write_json(&out.join("spec.json"), &spec)?;
+        write_json(&out.join("spec.json"), &spec)?;
         tce_base::write_atomically(&out.join("config.toml"), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
-        tce_base::begin_step(&training_step(method.name));
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
-        let mut policies = Vec::new();
-        let (learner, evaluation) = (&self.config.learner, &self.config.evaluation);
-        let learned = learn(data, learner, evaluation, arena, (out, &key), device, |trained| {
-            policies = save_policies(trained, seeds, out, inputs)?;
-            Ok(())
-        })?;
+        let (policies, learned) =
+            self.train(method.name, data, &self.config.learner, arena, (out, &key), inputs, device)?;
         let verdict = match self.comparison {
             Comparison::Skip => None,
             Comparison::Recommend => {
@@ -137,19 +167,15 @@ impl TrainingRun<'_> {
             }
         };
         let trained = Trained { policies, seeds: seeds.to_vec(), learned, verdict };
-        tce_base::write_json(&out.join("summary.json"), &trained)?;
+        let inside = |path: &Path| path.strip_prefix(out).unwrap_or(path).to_owned();
+        write_json(&out.join("summary.json"), &trained.clone().with_paths(inside))?;
         Ok(trained)
     }
 
     /// What every seed learns from.
     fn members(&self, inputs: &Inputs) -> Result<Vec<MemberData>> {
-        // Models of the dynamics cannot use a terminal row without a successor.
+        let target = inputs.taught(self.config);
         let complete = !self.config.learner.algorithm.about().successors;
-        let target = match complete {
-            true => inputs.learned_from(&self.config.target),
-            false => inputs.imitated(&self.config.target),
-        };
-        let target = Arc::new(target.into_owned());
         if let Some(choice) = inputs.choice(&self.config.target) {
             tce_base::note!("{}", choice.reason);
         }
@@ -169,16 +195,40 @@ impl TrainingRun<'_> {
         Ok(self.seeds.iter().map(member).collect())
     }
 
+    /// Trains a policy per seed in a directory, or takes them from it if this training is done. `key` is the hash of all its inputs.
+    fn train(
+        &self,
+        name: &str,
+        data: Vec<MemberData>,
+        learner: &LearnerConfig,
+        arena: Option<Arena>,
+        (directory, key): (&Path, &str),
+        inputs: &Inputs,
+        device: &Device,
+    ) -> Result<(Vec<PathBuf>, Learned)> {
+        tce_base::begin_step(&training_step(name));
+        let names = self.seeds.iter().map(|&seed| policy_file(seed));
+        if let Some(done) = Done::read(directory, key)? {
+            tce_base::note!("{name}: learned before, in {}", directory.display());
+            return Ok((names.map(|name| directory.join(name)).collect(), done.learned));
+        }
+        let mut files = Vec::new();
+        let evaluation = &self.config.evaluation;
+        let (learned, leftovers) = learn(data, learner, evaluation, arena, (directory, key), device, |policies| {
+            files = save_policies(policies, self.seeds, directory, inputs)?;
+            Ok(())
+        })?;
+        let done = Done { key: key.to_owned(), policies: sha256_files(directory, names)?, learned };
+        write_json(&directory.join(LEARNED), &done)?;
+        leftovers.discard();
+        Ok((files, done.learned))
+    }
+
     /// Trains the baseline: an ensemble of clones of the target rows per seed, in `baseline/`.
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
         let directory = self.out.join("baseline");
-        tce_base::begin_step(&training_step(BASELINE));
-        let mut files = Vec::new();
-        learn(data, &learner, &self.config.evaluation, None, (&directory, key), device, |policies| {
-            files = save_policies(policies, self.seeds, &directory, inputs)?;
-            Ok(())
-        })?;
+        let (files, _) = self.train(BASELINE, data, &learner, None, (&directory, key), inputs, device)?;
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 
@@ -194,7 +244,7 @@ impl TrainingRun<'_> {
         keep(alone.map_or_else(|| recommend(evaluator, &candidates, fitted_q), Ok)?, self.out)
     }
 
-    /// All inputs that decide the result.
+    /// All inputs that decide the result. The source's rows decide the comparison alone.
     fn spec(&self, inputs: &Inputs, device: &Device) -> serde_json::Value {
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": self.config, "seeds": self.seeds, "own": self.own,
@@ -226,15 +276,30 @@ impl TrainingRun<'_> {
     }
 }
 
-/// The finished training of `spec` in `out`; None if it has to be started or resumed.
+/// The inputs that decide the policies.
+fn without_source(spec: &serde_json::Value) -> serde_json::Value {
+    let mut spec = spec.clone();
+    spec.as_object_mut().map(|inputs| inputs.remove("source"));
+    spec
+}
+
+/// The finished training of `spec` in `out`; None if something of it is missing.
 ///
 /// # Errors
 /// If `out` holds results or checkpoints of another training.
-fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
-    let (spec_file, summary_file) = (out.join("spec.json"), out.join("summary.json"));
-    let summary = read_if_there(&summary_file)?;
-    let same = match read_if_there(&spec_file)? {
-        Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| found == *spec),
+fn found(out: &Path, spec: &serde_json::Value, comparison: Comparison) -> Result<Option<Trained>> {
+    let summary = read_if_there(&out.join("summary.json"))?;
+    let trained = summary.as_deref().and_then(|bytes| serde_json::from_slice::<Trained>(bytes).ok());
+    let compared = trained.as_ref().is_some_and(|t| t.verdict.is_some());
+    let same = match read_if_there(&out.join("spec.json"))? {
+        Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| {
+            // The source decides the comparison alone: policies that were not compared may be compared with any.
+            if compared && comparison == Comparison::Recommend {
+                found == *spec
+            } else {
+                without_source(&found) == without_source(spec)
+            }
+        }),
         None => summary.is_none(),
     };
     if !same {
@@ -245,11 +310,8 @@ fn found(out: &Path, spec: &serde_json::Value) -> Result<Option<Trained>> {
             if summary.is_some() { " (tce evaluate tries a policy that is there)" } else { ", or remove it" }
         )));
     }
-    let Some(bytes) = summary else { return Ok(None) };
-    let trained = serde_json::from_slice::<Trained>(&bytes);
-    match trained.map(|r| (r.policies.iter().all(|p| p.exists()), r)) {
-        Ok((true, trained)) => Ok(Some(trained)),
-        // Its policies were removed or moved: they are learned again.
-        _ => Ok(None),
-    }
+    let trained = trained.map(|t| t.with_paths(|path| out.join(path)));
+    // Policies that were removed are learned again.
+    let whole = |t: &Trained| t.policies.iter().all(|p| p.exists());
+    Ok(trained.filter(|t| whole(t) && (compared || comparison == Comparison::Skip)))
 }

@@ -11,12 +11,13 @@
 //!
 //! Learned dynamics have errors, above all away from the data: there they invent returns, and nothing counts. If the difference is smaller
 //! than what they can resolve, the baseline is recommended. Where they lose either policy before half of an episode ([`WHOLE`]), the
-//! verdict says so and is not sure, however large the difference is: the rest of the episode may decide otherwise.
+//! verdict says so and is not sure, however large the difference is: the rest of the episode may decide otherwise. Of target rows in no
+//! order, the length of an episode has to be known for a verdict to be sure.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{Progress, mean_std};
+use tce_base::{Progress, mean_and_error, mean_std};
 use tce_learn::{FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
 
@@ -101,14 +102,8 @@ fn episodes(estimates: &[OffPolicyEstimate]) -> Vec<f64> {
     (0..n).map(|i| estimates.iter().map(|j| j.supported[i]).sum::<f64>() / count).collect()
 }
 
-/// Mean and its standard error.
-pub fn mean_and_error(values: &[f64]) -> [f64; 2] {
-    let (mean, std) = mean_std(values);
-    [mean, std / (values.len().max(1) as f64).sqrt()]
-}
-
 /// Mean and standard error of the paired differences.
-fn difference(a: &[f64], b: &[f64]) -> [f64; 2] {
+fn difference(a: &[f64], b: &[f64]) -> (f64, f64) {
     mean_and_error(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>())
 }
 
@@ -156,6 +151,10 @@ pub fn recommend(
     let estimates = policies.iter().map(|own| own.iter().map(try_one).collect()).collect::<Result<Vec<Vec<_>>>>()?;
     progress.finish();
     let mut verdict = decide(candidates, &estimates)?;
+    if let Some(doubt) = evaluator.doubt() {
+        verdict.reason = format!("{} {doubt}", verdict.reason);
+        verdict.sure = false;
+    }
     if let Some((config, device)) = fitted_q {
         let values = evaluator.values(&policies.concat(), config, device)?;
         let mut values = values.iter();
@@ -190,15 +189,18 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
     };
     let standard = best(&|k| candidates[k].baseline).or_else(|| best(&|_| true));
     let standard = standard.ok_or_else(|| Error::Failed("there is no policy to recommend".into()))?;
-    let over: Vec<[f64; 2]> = returns.iter().map(|r| difference(r, &returns[standard])).collect();
-    let beats = |k: usize| over[k][0] > SURE * over[k][1] && over[k][0] > LEAST * mean(standard).abs();
+    let over: Vec<(f64, f64)> = returns.iter().map(|r| difference(r, &returns[standard])).collect();
+    let beats = |k: usize| {
+        let (by, error) = over[k];
+        by > SURE * error && by > LEAST * mean(standard).abs()
+    };
     let chosen = best(&|k| !candidates[k].baseline && beats(k)).unwrap_or(standard);
     let next_best = best(&|k| k != chosen);
     let gap = next_best.map(|k| difference(&returns[chosen], &returns[k]));
     let name = |k: usize| &candidates[k].name;
-    let digits = gap.map_or(0, |[_, error]| decimals(error));
+    let digits = gap.map_or(0, |(_, error)| decimals(error));
     let reason = match (next_best, gap) {
-        (Some(k), Some([by, error])) if chosen != standard => {
+        (Some(k), Some((by, error))) if chosen != standard => {
             format!(
                 "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.digits$}, {} {:.digits$} (difference from the next best {by:.digits$} ± {error:.digits$}).",
                 name(chosen),
@@ -207,7 +209,7 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
                 mean(standard),
             ) + if k == standard { "" } else { " The next best is not a baseline." }
         }
-        (Some(k), Some([by, error])) => {
+        (Some(k), Some((by, error))) => {
             let next = name(k);
             let told = match by >= 0.0 {
                 true => format!("the next best, {next}, {by:.digits$} ± {error:.digits$} less"),
@@ -236,17 +238,17 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
         baseline: candidates[k].baseline,
         imagined_return: of_seeds(k, &|j| j.imagined_return),
         supported_return: Some(mean(k)),
-        standard_error: mean_and_error(&returns[k])[1],
+        standard_error: mean_and_error(&returns[k]).1,
         survival: of_seeds(k, &|j| j.survival),
         support: Some(support(k)),
         action_error: of_seeds(k, &|j| j.action_error),
         fitted_q: None,
-        over_standard: over[k],
+        over_standard: over[k].into(),
     };
     Ok(Verdict {
         method: name(chosen).clone(),
         policy: candidates[chosen].files[seed.unwrap_or(0)].clone(),
-        sure: gap.is_none_or(|[by, error]| by > SURE * error) && known >= WHOLE,
+        sure: gap.is_none_or(|(by, error)| by > SURE * error) && known >= WHOLE,
         reason,
         tried: (0..candidates.len()).map(tried).collect(),
         behaviour_value: None,

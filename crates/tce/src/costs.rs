@@ -52,10 +52,9 @@ impl Rates {
             GeneratedRows::None => self.seconds("labels", config.labels.training.steps as f64)?,
             GeneratedRows::Tce => {
                 // A network that trains until it is done is taken to need all that it may.
-                let updates = g.state_steps.most(g.until_done.state_limit)
-                    + g.transition_steps.most(g.until_done.transition_limit);
-                let rows =
-                    if g.rows == 0 { (1.0 - config.mixture.lambda) * config.source.rows as f64 } else { g.rows as f64 };
+                let updates = g.state_steps.given().unwrap_or(g.until_done.state_limit)
+                    + g.transition_steps.given().unwrap_or(g.until_done.transition_limit);
+                let rows = g.rows_beside(config.mixture.lambda, config.source.rows) as f64;
                 self.seconds("score-train", updates as f64)?
                     + self.seconds("labels", config.labels.training.steps as f64)?
                     + self.seconds("sample", 2.0 * rows)?

@@ -40,7 +40,8 @@ pub fn estimates(policies: impl Iterator<Item = Estimated>, logged: Option<f64>)
     format!(
         "Estimated without a simulator (± standard error):\n{}\n\
          imagined return: of episodes in learned dynamics of the robot\n\
-         supported: the imagined return until the episode is far from every target state; recommendations go by it\n\
+         supported: the imagined return until the episode is far from every target state; recommendations go by it. If\n\
+         rewards can be negative, each later step counts as a bad reward, so that leaving early does not pay\n\
          support: share of a whole episode's steps before that, or before the imagined episode ends\n\
          fitted Q: return with each later reward worth 1 % less, by fitted Q evaluation on the target's rows\n\
          action error: RMSE against the target rows' own actions, in a range of 2; it tells how closely they are cloned\n",

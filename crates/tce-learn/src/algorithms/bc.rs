@@ -38,11 +38,11 @@ use std::path::Path;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
+use tce_base::{OrAuto, Streams};
 use tce_nn::{Device, NamedParameters, NetworkError, Tensor};
 
 use crate::actor::{Actor, ActorConfig, PolicyForm};
-use crate::bc_dropout::{DropoutRate, chosen};
+use crate::bc_dropout::chosen;
 use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::method::{About, Built, LearnedRows, Method, OtherRows, RowScores, Setup};
@@ -69,7 +69,7 @@ impl Method for BcConfig {
     }
 
     fn check(&self) -> Result<(), LearnError> {
-        if let DropoutRate::Share(share) = self.dropout {
+        if let OrAuto::Given(share) = self.dropout {
             within("dropout", share, 0.0..=0.9)?;
         }
         within("fade", self.fade, 0.0..=1.0)?;
@@ -83,7 +83,7 @@ impl Method for BcConfig {
     }
 
     fn build(&self, on: &Setup<'_>) -> Built {
-        let DropoutRate::Auto = self.dropout else {
+        let OrAuto::Auto = self.dropout else {
             return Ok(Some(Box::new(Bc::new(on.buffer, self, on.steps, on.device)?)));
         };
         let single = BcConfig { ensemble: 1, ..self.clone() };
@@ -120,7 +120,7 @@ pub struct BcConfig {
     /// Share of hidden units that are left out of each update, at random. "auto": 0.3 where it lowers a clone's error at rows that it has
     /// not seen, else none.
     #[serde(skip_serializing_if = "is_zero")]
-    pub dropout: DropoutRate,
+    pub dropout: OrAuto<f64>,
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
     /// as without them.
     pub mixed_steps: u64,
@@ -142,7 +142,7 @@ impl Default for BcConfig {
         Self {
             actor: ActorConfig::default(),
             ensemble: 1,
-            dropout: DropoutRate::default(),
+            dropout: OrAuto::default(),
             mixed_steps: 0,
             fade: 0.0,
             batch: 0,
@@ -195,7 +195,7 @@ impl Bc {
     /// # Errors
     /// If the configuration cannot be used. `dropout = "auto"` is a training of its own: [`Method::build`] does it.
     pub fn new(buffer: &Buffer, config: &BcConfig, steps: u64, device: &Device) -> Result<Self, LearnError> {
-        let DropoutRate::Share(share) = config.dropout else {
+        let OrAuto::Given(share) = config.dropout else {
             return Err(LearnError::invalid("dropout", "\"auto\"", "a share", "build the learner with Method::build"));
         };
         Self::with_dropout(buffer, config, vec![share; buffer.members().len()], steps, device)
@@ -220,7 +220,7 @@ impl Bc {
             k => Actor::named(&format!("policy {k}"), buffer, &policy, steps, device),
         };
         let actors = (0..config.ensemble).map(actor).collect::<Result<_, _>>()?;
-        let told = config.dropout == DropoutRate::Auto;
+        let told = config.dropout == OrAuto::Auto;
         Ok(Self { actors, members: buffer.streams(), dropout, told, loss: config.loss })
     }
 }

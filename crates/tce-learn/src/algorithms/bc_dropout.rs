@@ -17,11 +17,8 @@
 //! between them is bad, and dropout smooths it: Walker2d, kinematic, 51.1 without and 79.1 with it. The error at rows that the clone has not
 //! seen tells the two apart (bench/expansion.md).
 
-use std::fmt;
 use std::sync::Arc;
 
-use serde::de::{Error, Unexpected, Visitor};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tce_base::Streams;
 use tce_data::{Transitions, fold_of_runs};
 use tce_nn::Device;
@@ -42,68 +39,6 @@ const FOLDS: usize = 4;
 const STEPS: u64 = 4_000;
 /// With fewer rows nothing is held out, and there is no dropout.
 const FEWEST: usize = 250;
-
-/// Share of the hidden units that are left out of an update.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum DropoutRate {
-    /// This share.
-    Share(f64),
-    /// `"auto"`: none, or [`MUCH`], by the error at rows that a clone has not seen.
-    Auto,
-}
-
-impl Default for DropoutRate {
-    fn default() -> Self {
-        Self::Share(0.0)
-    }
-}
-
-impl Serialize for DropoutRate {
-    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Self::Share(share) => to.serialize_f64(*share),
-            Self::Auto => to.serialize_str("auto"),
-        }
-    }
-}
-
-impl schemars::JsonSchema for DropoutRate {
-    fn schema_name() -> std::borrow::Cow<'static, str> {
-        "DropoutRate".into()
-    }
-
-    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        schemars::json_schema!({ "anyOf": [{ "type": "number", "minimum": 0, "maximum": 0.9 }, { "const": "auto" }] })
-    }
-}
-
-impl<'de> Deserialize<'de> for DropoutRate {
-    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        struct Words;
-        impl Visitor<'_> for Words {
-            type Value = DropoutRate;
-            fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
-                f.write_str("a share from 0 to 0.9, or \"auto\"")
-            }
-            fn visit_f64<E>(self, share: f64) -> Result<DropoutRate, E> {
-                Ok(DropoutRate::Share(share))
-            }
-            fn visit_u64<E>(self, share: u64) -> Result<DropoutRate, E> {
-                Ok(DropoutRate::Share(share as f64))
-            }
-            fn visit_i64<E>(self, share: i64) -> Result<DropoutRate, E> {
-                Ok(DropoutRate::Share(share as f64))
-            }
-            fn visit_str<E: Error>(self, word: &str) -> Result<DropoutRate, E> {
-                match word {
-                    "auto" => Ok(DropoutRate::Auto),
-                    _ => Err(E::invalid_value(Unexpected::Str(word), &self)),
-                }
-            }
-        }
-        from.deserialize_any(Words)
-    }
-}
 
 /// The dropout of every member of `buffer`, whose clones are trained for `steps` steps. It depends on the member's target rows and their
 /// standardisation, and on nothing else: members of different seeds have the same. `clones` makes clones of the members of a buffer, with
@@ -134,7 +69,8 @@ pub(super) fn chosen<L: PolicyLearner>(
                 let folds = Folds::of(member);
                 let rows = Buffer::new(folds.members, buffer.batch())?;
                 let mut learner = clones(&rows, folds.rates, steps)?;
-                if !prepare(&mut learner, &rows, steps, &format!("clone dropout {m}"), place, device)? {
+                let label = if m == 0 { "choose dropout".to_owned() } else { format!("choose dropout {m}") };
+                if !prepare(&mut learner, &rows, steps, &label, place, device)? {
                     return Ok(None);
                 }
                 told(&learner.policies(), &folds.unseen)
@@ -183,20 +119,4 @@ fn told(policies: &[Policy], unseen: &[Transitions]) -> f64 {
     }
     let [without, with] = squares.map(f64::sqrt);
     if with < (1.0 - MARGIN) * without { MUCH } else { 0.0 }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_key_is_a_share_or_a_word() {
-        let read = |text: &str| serde_json::from_str::<DropoutRate>(text);
-        assert_eq!(read("0.2").unwrap(), DropoutRate::Share(0.2));
-        assert_eq!(read("0").unwrap(), DropoutRate::Share(0.0));
-        assert_eq!(read("\"auto\"").unwrap(), DropoutRate::Auto);
-        assert!(read("\"much\"").unwrap_err().to_string().contains("a share from 0 to 0.9, or \"auto\""));
-        assert_eq!(serde_json::to_string(&DropoutRate::Auto).unwrap(), "\"auto\"");
-        assert_eq!(serde_json::to_string(&DropoutRate::Share(0.3)).unwrap(), "0.3");
-    }
 }

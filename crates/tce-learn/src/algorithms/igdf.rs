@@ -45,7 +45,9 @@ const ABOUT: About = About {
     title: "IGDF",
     description: "IQL; source rows chosen by a contrastive model of the target's dynamics",
     reference: "Wen et al. 2024; ODRL",
-    published: Some("the contrastive model is never trained; with code = \"authors\", no row weighs more than another"),
+    published: Some(
+        "the contrastive model is never trained; with learner.igdf.code = \"authors\" instead all rows have the same weight",
+    ),
     table: "igdf",
     needs: OtherRows::Source,
     successors: true,
@@ -85,10 +87,10 @@ impl Method for IgdfConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Code {
-    /// φ and ψ are never trained.
+    /// ODRL's: φ and ψ are never trained.
     #[default]
     Odrl,
-    /// Weights are broadcast over the rows.
+    /// IGDF's authors': all rows have the same weight, by a broadcast.
     Authors,
 }
 
@@ -96,9 +98,9 @@ pub enum Code {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IgdfConfig {
-    /// As meant, or with the defect of `code`.
+    /// As meant, or with the defect that `learner.igdf.code` names.
     pub mode: Mode,
-    /// Whose defect `mode = "published"` has; nothing where `mode` is corrected.
+    /// Whose defect `learner.igdf.mode = "published"` has. It changes nothing where the mode is "corrected".
     pub code: Code,
     /// ξ, the share of a batch's source rows that the critics see, those with the highest scores. Source: ODRL, .25 and .5 on some
     /// tasks.

@@ -88,6 +88,9 @@ impl PolicySpec {
             let found = format!("{} means, {} divisors", z.mean.len(), z.std.len());
             return Some(("standardizer", found, format!("{n} of each, divisors positive")));
         }
+        if let Some(clip) = self.clip.filter(|clip| clip.is_nan() || *clip < 0.0) {
+            return Some(("clip", clip.to_string(), "a number from 0 on".into()));
+        }
         match &self.head {
             Head::Gaussian { log_std } if log_std.len() != self.actions => {
                 Some(("log_std", format!("{} numbers", log_std.len()), format!("{}", self.actions)))

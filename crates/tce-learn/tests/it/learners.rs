@@ -5,16 +5,16 @@ use std::sync::Arc;
 
 use crate::common::go;
 use rand::RngExt;
-use tce_base::Streams;
 use tce_base::random::fill_normal;
+use tce_base::{OrAuto, Streams};
 use tce_data::{Standardizer, Transitions};
 use tce_learn::dmc::{Dmc, DmcConfig};
 use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, DropoutRate, LabelConfig, LearnError, Learner, Member, Meter, Method,
-    Mode, Place, Policy, PolicyLearner, Setup, best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, LabelConfig, LearnError, Learner, Member, Meter, Method, Mode, Place,
+    Policy, PolicyLearner, Setup, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -115,13 +115,9 @@ fn dropout_keeps_a_clone_from_fitting_the_noise_of_its_rows() {
     let buffer = Buffer::new(vec![member(1, &data, true), member(2, &data, true)], 64).unwrap();
     let error = |dropout: f64| {
         let actor = ActorConfig { hidden: vec![128, 128, 128], lr: 1e-3, ..ActorConfig::default() };
-        let mut bc = Bc::new(
-            &buffer,
-            &BcConfig { actor, dropout: DropoutRate::Share(dropout), ..BcConfig::default() },
-            1500,
-            &cpu(),
-        )
-        .unwrap();
+        let mut bc =
+            Bc::new(&buffer, &BcConfig { actor, dropout: OrAuto::Given(dropout), ..BcConfig::default() }, 1500, &cpu())
+                .unwrap();
         run(&mut bc, &buffer, 1500);
         // At the training rows themselves, anything fitted beyond the behaviour's mean is noise.
         let square = |policy: &Policy, i: usize| (action(policy, data.observation(i))[0] - data.action(i)[0]).powi(2);
@@ -151,7 +147,7 @@ fn the_data_tell_whether_clones_take_dropout() {
     let noisy = rows_of(|_, noise| 0.4 * noise);
     let exact = rows_of(|s, _| 0.5 * s[0]);
     let few = Arc::new(noisy.select(&(0..200).collect::<Vec<_>>()));
-    let config = BcConfig { dropout: DropoutRate::Auto, ..BcConfig::default() };
+    let config = BcConfig { dropout: OrAuto::Auto, ..BcConfig::default() };
     let chosen = |members: Vec<Member>| {
         let (buffer, device) = (Buffer::new(members, 64).unwrap(), cpu());
         let (iql, behaviour) = (IqlConfig::paper(), RegulariserConfig::paper());
@@ -179,7 +175,7 @@ fn dropout_is_a_members_own_and_a_training_with_it_resumes() {
     let data = noisy_data();
     let members = [member(1, &data, true), member(2, &data, true)];
     let actor = ActorConfig { hidden: vec![16, 16], ..ActorConfig::default() };
-    let config = BcConfig { actor, dropout: DropoutRate::Share(0.3), ensemble: 2, ..BcConfig::default() };
+    let config = BcConfig { actor, dropout: OrAuto::Given(0.3), ensemble: 2, ..BcConfig::default() };
     let new = |members: &[Member]| {
         let buffer = Buffer::new(members.to_vec(), 32).unwrap();
         (Bc::new(&buffer, &config, 20, &cpu()).unwrap(), buffer)

@@ -50,6 +50,7 @@ pub fn augment_rows(
     root: &Path,
     device: &Device,
 ) -> Result<Augmentation> {
+    let inputs = &*inputs.seen_by(config);
     match config.mixture.generated {
         GeneratedRows::Tce => two_stages(inputs, config, seeds, root, device),
         GeneratedRows::Synther | GeneratedRows::Dmc => single_stage::augment_rows(inputs, config, seeds, root, device),
@@ -60,12 +61,15 @@ pub fn augment_rows(
     }
 }
 
-/// What the observations of both domains respect.
-fn support(inputs: &Inputs) -> Support {
+/// What generated rows are made to respect, where `config` says so: what the observations of all data do.
+pub fn support(inputs: &Inputs, config: &Config) -> Option<Support> {
+    if !config.generator.support {
+        return None;
+    }
     let tables: Vec<_> = std::iter::once(&inputs.target).chain(&inputs.source).map(|t| &*t.rows).collect();
     let support = support_of(&tables);
     support.describe().iter().for_each(|finding| tce_base::note!("generated rows respect: {finding}"));
-    support
+    Some(support)
 }
 
 /// What decides TCE's generated rows.
@@ -89,10 +93,15 @@ struct Spec<'a> {
 fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Augmentation> {
     let (generator, place, _) = networks(inputs, config, seeds, root, device)?;
     let (models, labels, label_errors) = label_models(inputs, &config.labels, seeds, root, device)?;
-    let rows = match config.generator.rows {
-        0 => ((1.0 - config.mixture.lambda) * inputs.source_rows()?.len() as f64).round() as usize,
-        rows => rows,
-    };
+    let source = if config.generator.rows == 0 { inputs.source_rows()?.len() } else { 0 };
+    let rows = config.generator.rows_beside(config.mixture.lambda, source);
+    if rows == 0 {
+        return Err(Error::Usage(format!(
+            "generator.rows = 0 means (1 - mixture.lambda) times the source rows: found none of {source} at mixture.lambda = {}, expected at least one; \
+             give a number of rows",
+            config.mixture.lambda
+        )));
+    }
     let evaluator = match config.filter.by_dynamics() {
         true => Some(OffPolicyEvaluator::train(inputs, &config.dynamics, root, device)?),
         false => None,
@@ -137,10 +146,10 @@ fn sampled(
 ) -> Result<Vec<Labelled>> {
     let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
     let target = &*inputs.imitated(&config.target);
-    let support = config.generator.support.then(|| support(inputs));
+    let support = support(inputs, config);
     let kept = Some(Chunks { directory: attempt.directory(), key: attempt.key() });
-    let draw = Draw { sampler: &config.generator.sampler, members: &members, target, kept };
-    let (states, successors) = generator.sample_pairs(rows, config.generator.y_max, support.as_ref(), &draw)?;
+    let draw = Draw { sampler: &config.generator.sampler, members: &members, target, kept, support: support.as_ref() };
+    let (states, successors) = generator.sample_pairs(rows, config.generator.y_max, &draw)?;
     let per_member = rows * generator.units.live.len();
     let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
     let mut finished = finisher.finish(&pairs)?;

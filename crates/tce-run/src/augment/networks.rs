@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use serde::Serialize;
-use tce_augment::config::{Length, UntilDoneConfig};
+use tce_augment::config::UntilDoneConfig;
 use tce_augment::two_stage::{Generator, Trained};
 use tce_augment::work::Work;
+use tce_base::OrAuto;
 use tce_diffusion::{Process, Schedule, ScoreModel, Target};
 use tce_nn::Device;
 
@@ -26,8 +27,8 @@ struct Spec<'a> {
     seeds: &'a [u64],
     process: Process,
     target: Target,
-    state_steps: Length,
-    transition_steps: Length,
+    state_steps: OrAuto<u64>,
+    transition_steps: OrAuto<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     until_done: Option<UntilDoneConfig>,
     batch: usize,
@@ -52,8 +53,8 @@ pub fn networks(
     let g = &config.generator;
     // Inferred actions tell when q_tran is done.
     let action_models = match g.transition_steps {
-        Length::Auto => Some(label_models(inputs, &config.labels, seeds, root, device)?),
-        Length::Steps(_) => None,
+        OrAuto::Auto => Some(label_models(inputs, &config.labels, seeds, root, device)?),
+        OrAuto::Given(_) => None,
     };
     let spec = Spec {
         inputs: inputs.spec_imitated(Domains::with_source(g.source_states), &config.target),
@@ -63,7 +64,7 @@ pub fn networks(
         target: g.target,
         state_steps: g.state_steps,
         transition_steps: g.transition_steps,
-        until_done: [g.state_steps, g.transition_steps].contains(&Length::Auto).then_some(g.until_done),
+        until_done: [g.state_steps, g.transition_steps].contains(&OrAuto::Auto).then_some(g.until_done),
         batch: g.batch,
         learning_rate: g.learning_rate,
         schedule: g.schedule,

@@ -13,7 +13,7 @@ use tce_augment::score_training::held_out_rows;
 use tce_augment::two_stage::{Draw, Generator};
 use tce_base::metrics::recorded;
 use tce_base::{Streams, sha256_file};
-use tce_data::{Agent, Shift, Transitions};
+use tce_data::{Agent, Shift, Support, Transitions};
 use tce_diagnosis::{HeldOut, ImpliedActions, ImpliedErrors, ImpliedRollout};
 use tce_diffusion::ScoreModel;
 use tce_learn::{LabelModels, TerminalHandling};
@@ -24,7 +24,7 @@ use super::generator::{Consistency, consistency, step_std};
 use super::implied::{DRAWS, ImpliedActor, implied_actions, rollout_implied};
 use super::measures::pairs;
 use crate::augment::label_models;
-use crate::augment::networks;
+use crate::augment::{networks, support};
 use crate::config::Config;
 use crate::error::Result;
 use crate::inputs::Inputs;
@@ -76,6 +76,7 @@ struct Bench<'a> {
     /// Live dimensions of states at ŷ = 0.
     states: Vec<f32>,
     step: Vec<f32>,
+    support: Option<Support>,
     split: (Vec<usize>, Vec<usize>),
     held_out: Option<HeldOut>,
     episodes: usize,
@@ -87,7 +88,9 @@ impl Bench<'_> {
     fn measure(&self, generator: &Generator) -> Result<AtCycle> {
         let (units, sampler) = (&generator.units, self.config.generator.sampler);
         let members = [self.streams];
-        let successors = generator.sample_successors(&self.states, &Draw::new(&sampler, &members, self.target))?;
+        let support = self.support.as_ref();
+        let draw = Draw { support, ..Draw::new(&sampler, &members, self.target) };
+        let successors = generator.sample_successors(&self.states, &draw)?;
         let pair = (units.put_back(&self.states), units.put_back(&successors));
         let rows = self.models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
         let comparison = self.held_out.as_ref().map(|h| h.compare(&pairs(units, &rows), &self.streams)).transpose()?;
@@ -143,23 +146,28 @@ pub fn cycles(
     let Asked { place, seed, rows, episodes } = asked;
     let (mut generator, stage, trained) = networks(inputs, config, &[seed], root, device)?;
     let (models, ..) = label_models(inputs, &config.labels, &[seed], root, device)?;
-    let target = &inputs.target.rows;
+    let target = &*inputs.imitated(&config.target);
+    let support = support(inputs, config);
     let streams = Streams::new(seed).child("diagnosis/cycles");
     let units = generator.units.clone();
     let step = step_std(target, &units.live);
     let episodes_of = target.episodes().iter().map(|e| e.start..e.end).collect();
+    let members = [streams];
+    let draw = Draw { support: support.as_ref(), ..Draw::new(&config.generator.sampler, &members, target) };
+    let states = generator.sample_states(rows, 0.0, &draw)?;
     let bench = Bench {
         target,
         models: &models,
         config,
         place,
-        states: generator.sample_states(rows, 0.0, &Draw::new(&config.generator.sampler, &[streams], target))?,
+        states,
         split: held_out_rows(target.len(), &config.generator),
         held_out: HeldOut::new(pairs(&units, target), 2 * units.live.len(), episodes_of)?,
         episodes,
         streams,
         device,
         step: step.clone(),
+        support,
     };
     let metric = |name: &str| recorded(&stage.file("metrics.jsonl"), "transition", 0, name);
     let (training, held_out): (BTreeMap<u64, f64>, BTreeMap<u64, f64>) =
@@ -181,10 +189,7 @@ pub fn cycles(
     }
     if !networks.iter().any(|n| n.chosen) {
         generator.transition = chosen;
-        let updates = match config.generator.transition_steps {
-            tce_augment::config::Length::Steps(steps) => Some(steps),
-            tce_augment::config::Length::Auto => None,
-        };
+        let updates = config.generator.transition_steps.given();
         let found = AtCycle { updates, chosen: true, ..bench.measure(&generator)? };
         said(&found);
         networks.push(found);

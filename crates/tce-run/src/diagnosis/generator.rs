@@ -14,7 +14,7 @@ use tce_augment::config::GeneratorConfig;
 use tce_augment::finish::Finisher;
 use tce_augment::two_stage::{Draw, Generator};
 use tce_base::Streams;
-use tce_data::{Agent, Rows, Shift, Standardizer, Transitions};
+use tce_data::{Agent, Rows, Shift, Standardizer, Support, Transitions};
 use tce_diffusion::Sampler;
 use tce_diffusion::metrics::{sliced_wasserstein, std_ratios};
 use tce_learn::{LabelModels, TerminalHandling};
@@ -113,6 +113,8 @@ pub struct Tried<'a> {
     pub training: &'a Transitions,
     /// Rows that they were not.
     pub held_out: &'a Transitions,
+    /// What expanded rows are made to respect.
+    pub support: Option<&'a Support>,
     /// Where the truth is simulated.
     pub place: (Agent, Shift),
 }
@@ -123,7 +125,7 @@ impl Tried<'_> {
     /// # Errors
     /// If the sampler or the simulator fails.
     pub fn quality(&self, sampler: &Sampler, rows: usize, seed: u64) -> Result<Quality> {
-        let Self { generator, models, config, finisher, training, held_out, place: (agent, shift) } = *self;
+        let Self { generator, models, config, finisher, training, held_out, support, place: (agent, shift) } = *self;
         let members = [Streams::new(seed)];
         let units = &generator.units;
         let d = units.live.len();
@@ -143,8 +145,7 @@ impl Tried<'_> {
         let step = step_std(training, &units.live);
         let pair = (units.put_back(&states), units.put_back(&successors));
         let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-        let wider_states = generator.sample_states(rows, config.y_max, &draw)?;
-        let wider_successors = generator.sample_successors(&wider_states, &draw)?;
+        let (wider_states, wider_successors) = generator.sample_pairs(rows, config.y_max, &Draw { support, ..draw })?;
         let expanded = finisher.finish(&[(&wider_states, &wider_successors)])?.remove(0).transitions;
         Ok(Quality {
             evaluations: sampler.evaluations(),

@@ -79,8 +79,7 @@ impl<'a> ImpliedActor<'a> {
         };
         let denoiser = transition.bind(tensor(units.state.apply(states), [1, n, d], &self.device));
         let mut out = host(self.sampler.run(&process, &denoiser, x, &mut normal)?);
-        units.output.invert_in_place(&mut out);
-        units.target.decode(states, &mut out);
+        units.successors(states, &mut out);
         Ok(out)
     }
 

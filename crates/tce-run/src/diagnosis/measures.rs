@@ -1,5 +1,6 @@
 //! Every metric of a diagnosis.
 
+use tce_augment::config::FilterKind;
 use tce_augment::score_training::held_out_rows;
 use tce_augment::units::Units;
 use tce_base::{Streams, begin_step};
@@ -109,12 +110,13 @@ impl Work<'_> {
         begin_step(PARTS[4]);
         let pictured = [0.0, config.generator.y_max, *grid.last().expect("a grid")];
         let states = self.pictures(&pictured.map(|y| (y, &batches[at(y)])), sources.as_ref(), &streams);
+        let by_zscore = config.filter.enabled && config.filter.by == FilterKind::Zscore;
         Ok(Diagnosis {
             of: subject.of.clone(),
             task: subject.task,
             seed,
             y_max: decimal(config.generator.y_max),
-            z_threshold: config.filter.enabled.then_some(config.filter.z_threshold),
+            z_threshold: by_zscore.then_some(config.filter.z_threshold),
             lambda: config.mixture.lambda,
             rows: options.rows,
             target_rows: target.len(),
@@ -210,7 +212,7 @@ impl Work<'_> {
 
     /// Target rows to tell copies by.
     fn held_out(&self) -> Result<Option<memorisation::HeldOut>> {
-        let (units, target) = (self.units(), &self.subject.inputs.target.rows);
+        let (units, target) = (self.units(), self.sampler.target);
         let episodes = target.episodes().iter().map(|e| e.start..e.end).collect();
         Ok(memorisation::HeldOut::new(pairs(units, target), 2 * units.live.len(), episodes)?)
     }
@@ -278,7 +280,7 @@ impl Work<'_> {
     fn implied(&self, device: &Device) -> Result<Implied> {
         let Self { subject, options, sampler, .. } = self;
         let Subject { inputs, config, seed, .. } = **subject;
-        let target = &inputs.target.rows;
+        let target = sampler.target;
         let (generator, models) = (sampler.generator, sampler.finisher.models);
         let actor = ImpliedActor::new(generator, models, sampler.member, config.generator.sampler, target, device);
         let streams = Streams::new(seed).child("diagnosis/implied");

@@ -22,11 +22,12 @@ use tce_data::Task;
 use tce_diagnosis::Diagnosis;
 use tce_nn::Device;
 
-use crate::augment::{finisher, label_models, networks};
+use crate::augment::{finisher, label_models, networks, support};
 use crate::config::{Config, GeneratedRows};
 use crate::course::Course;
 use crate::error::{Error, Result};
-use crate::inputs::{Domains, Inputs};
+use crate::inputs::{Domains, InputSpec, Inputs};
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::stage::Stage;
 
 pub mod cycles;
@@ -45,7 +46,7 @@ pub use subject::{Options, Subject};
 use work::Work;
 
 /// Changes when the same rows would give other metrics.
-const VERSION: u32 = 5;
+const VERSION: u32 = 6;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
 
@@ -87,41 +88,52 @@ fn ensure_enough(inputs: &Inputs) -> Result<()> {
     Ok(())
 }
 
+/// What decides a diagnosis.
+#[derive(Serialize)]
+struct Spec<'a> {
+    version: u32,
+    of: &'a str,
+    task: Option<Task>,
+    inputs: InputSpec,
+    config: serde_json::Value,
+    seeds: &'a [u64],
+    seed: u64,
+    options: &'a Options,
+}
+
+impl<'a> Spec<'a> {
+    fn new(subject: &'a Subject, options: &'a Options) -> Self {
+        let Subject { inputs, config, seeds, seed, .. } = *subject;
+        let mut used = json!({
+            "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
+            "iql": config.learner.iql, "batch": config.learner.batch, "scores": config.evaluation.scores,
+        });
+        if config.filter.by_dynamics() {
+            used["dynamics"] = json!(config.dynamics);
+        }
+        Self {
+            version: VERSION,
+            of: &subject.of,
+            task: subject.task,
+            inputs: inputs.spec_imitated(Domains::Both, &config.target),
+            config: used,
+            seeds,
+            seed,
+            options,
+        }
+    }
+}
+
 /// Diagnoses, or takes the result from its stage under `root`. Returns it with the stage's directory.
 ///
 /// # Errors
 /// If the run has no generated rows of TCE, or a part of the work fails.
 pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Device) -> Result<(Diagnosis, PathBuf)> {
-    #[derive(Serialize)]
-    struct Spec<'a> {
-        version: u32,
-        of: &'a str,
-        task: Option<Task>,
-        inputs: crate::inputs::InputSpec,
-        config: serde_json::Value,
-        seeds: &'a [u64],
-        seed: u64,
-        options: &'a Options,
-    }
     let Subject { inputs, config, seeds, seed, .. } = *subject;
     can_be_diagnosed(&subject.of, config)?;
     let member = member_of(seeds, seed)?;
     ensure_enough(inputs)?;
-    let used = serde_json::json!({
-        "generator": config.generator, "filter": config.filter, "labels": config.labels, "mixture": config.mixture,
-        "iql": config.learner.iql, "batch": config.learner.batch, "scores": config.evaluation.scores,
-    });
-    let spec = Spec {
-        version: VERSION,
-        of: &subject.of,
-        task: subject.task,
-        inputs: inputs.spec(Domains::Both),
-        config: used,
-        seeds,
-        seed,
-        options,
-    };
-    let stage = Stage::open(root, "stages/diagnosis", &spec, device)?;
+    let stage = Stage::open(root, "stages/diagnosis", &Spec::new(subject, options), device)?;
     let file = "diagnosis.json".to_owned();
     if stage.summary::<serde_json::Value>()?.is_some() {
         return Ok((read(&stage.file(&file))?, stage.directory().to_owned()));
@@ -145,11 +157,19 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         (Some(agent), Some(shift)) if options.simulator => Some((agent, shift)),
         _ => None,
     };
+    let evaluator = config
+        .filter
+        .by_dynamics()
+        .then(|| OffPolicyEvaluator::train(inputs, &config.dynamics, root, device))
+        .transpose()?;
+    let imitated = inputs.imitated(&config.target);
     let sampler = Sampler {
         generator: &generator,
         finisher: &finisher,
-        config: &config.generator,
-        target: &inputs.target.rows,
+        config,
+        target: &imitated,
+        support: support(inputs, config),
+        evaluator,
         seeds,
         member,
         simulator,

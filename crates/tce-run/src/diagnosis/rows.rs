@@ -1,22 +1,29 @@
 //! Generated rows under a label bound, with all that is known of each: whether the filter keeps it, its labels, and what the
 //! simulator makes of it.
 
-use tce_augment::config::{FilterConfig, GeneratorConfig};
+use tce_augment::config::FilterConfig;
 use tce_augment::finish::{Finisher, everything_rejected};
 use tce_augment::two_stage::{Draw, Generator};
 use tce_base::Streams;
-use tce_data::{Agent, Shift, Transitions};
+use tce_data::{Agent, Shift, Support, Transitions};
 use tce_diffusion::uniform_labels;
 use tce_sim::{Simulated, simulate};
 
+use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::off_policy_evaluation::OffPolicyEvaluator;
 
 /// Where rows come from.
 pub struct Sampler<'a> {
     pub generator: &'a Generator,
     pub finisher: &'a Finisher<'a>,
-    pub config: &'a GeneratorConfig,
+    pub config: &'a Config,
+    /// What the networks were trained on.
     pub target: &'a Transitions,
+    /// What rows are made to respect.
+    pub support: Option<Support>,
+    /// What filters rows, where learned dynamics do.
+    pub evaluator: Option<OffPolicyEvaluator>,
     /// Of the whole population.
     pub seeds: &'a [u64],
     /// The one to look at.
@@ -85,10 +92,10 @@ impl Sampler<'_> {
         let members: Vec<Streams> =
             self.seeds.iter().map(|&s| Streams::new(s).child(&format!("diagnosis/{purpose}"))).collect();
         let Self { generator, config, target, .. } = self;
-        let (units, sampler) = (&generator.units, &config.sampler);
-        let draw = Draw::new(sampler, &members, target);
-        let all = generator.sample_states(rows, y_max, &draw)?;
-        let successors = generator.sample_successors(&all, &draw)?;
+        let units = &generator.units;
+        let support = self.support.as_ref();
+        let draw = Draw { support, ..Draw::new(&config.generator.sampler, &members, target) };
+        let (all, successors) = generator.sample_pairs(rows, y_max, &draw)?;
         let (d, labels) = (units.live.len(), uniform_labels(&members[self.member], "state", rows, y_max));
         let own = self.member * rows * d..(self.member + 1) * rows * d;
         // A row that is no numbers can neither be labelled nor simulated.
@@ -107,8 +114,13 @@ impl Sampler<'_> {
             let simulated = self.simulator.map(|_| Simulated::default());
             return Ok(Batch { rows, keep: vec![], labels: vec![], simulated, lost });
         }
-        let keep = self.finisher.keep(&s, &s2);
+        let mut keep = self.finisher.keep(&s, &s2);
         let rows = self.label(&units.put_back(&s), &units.put_back(&s2))?;
+        if let Some(evaluator) = &self.evaluator {
+            let mut possible = vec![false; rows.len()];
+            evaluator.possible(&rows, config.filter.margin).into_iter().for_each(|i| possible[i] = true);
+            keep.iter_mut().zip(possible).for_each(|(keep, possible)| *keep &= possible);
+        }
         let simulated = match self.simulator {
             Some((agent, shift)) => Some(simulate(agent, shift, &rows.observations, &rows.actions)?),
             None => None,

@@ -145,7 +145,7 @@ fn it_learns_like_any_other() {
             policies.extend(p.iter().map(|p| p.to_parameters().to_bytes()));
             Ok(())
         };
-        learn(vec![data(0), data(1)], &learner, &evaluation, None, place, &tce_nn::cpu(), keep).unwrap();
+        let _ = learn(vec![data(0), data(1)], &learner, &evaluation, None, place, &tce_nn::cpu(), keep).unwrap();
         policies
     };
     let first = train();

@@ -58,7 +58,7 @@ impl Augment {
         let config = self.config.layered(None, None)?.config()?;
         super::refuse::folder(&self.cache)?;
         let inputs = Inputs::of_files(Some(&self.source), &self.target, None, &self.own)?;
-        let inputs = inputs.with_target_rows(config.target.rows);
+        let inputs = inputs.with_target_rows(config.target.rows)?;
         let augmented = Augmented::new(&inputs, &config, self.seed, &self.cache, device)?;
         let target = &inputs.target_in_own_units();
         let (rows, origin) = match self.only_generated {

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::mean_and_error;
 use tce_learn::{DynamicsConfig, FittedQConfig, FittedValue, Policy};
 use tce_nn::Device;
 use tce_run::error::{Error, Result};
 use tce_run::inputs::Inputs;
 use tce_run::off_policy_evaluation::{OffPolicyEstimate, OffPolicyEvaluator};
 use tce_run::own::Own;
-use tce_run::verdict::mean_and_error;
 use tce_zoo::actors::read_policy;
 
 use crate::estimates::{Estimated, estimates};
@@ -79,6 +79,7 @@ impl CompareArgs {
         let policies = self.policies.iter().map(load).collect::<Result<Vec<_>>>()?;
         let config = DynamicsConfig { steps: self.dynamics_steps, ..DynamicsConfig::default() };
         let evaluator = OffPolicyEvaluator::train(&inputs, &config, &self.cache, device)?;
+        evaluator.doubt().iter().for_each(|doubt| tce_base::note!("warning: {doubt}"));
         let fitted_q = FittedQConfig { steps: self.fitted_q_steps, ..FittedQConfig::default() };
         let values = match fitted_q.steps {
             0 => vec![None; policies.len()],
@@ -105,7 +106,7 @@ fn render(report: &Report) -> String {
             policy: l.policy.display().to_string(),
             imagined_return: j.imagined_return,
             supported_return: j.supported_return,
-            standard_error: mean_and_error(&j.supported)[1],
+            standard_error: mean_and_error(&j.supported).1,
             support: Some(j.support),
             fitted_q: l.fitted_q.as_ref().map(|v| [v.mean(), v.standard_error()]),
             action_error: j.action_error,

@@ -228,14 +228,20 @@ impl Uses {
         let ordered = report.episodes != EpisodeEnds::NoOrder;
         let lengths = t.episodes().into_iter().map(|e| e.end - e.start);
         let terminals = t.terminals.iter().filter(|&&t| t).count();
+        // Without s' a terminal row tells a classifier nothing.
+        let known = t.terminals.iter().zip(&t.known).filter(|&(&t, &k)| t && k).count();
         Self {
             learning: t.len(),
             dynamics: t.known.iter().filter(|&&k| k).count(),
             episodes: if ordered { lengths.filter(|&n| n > 1).sum() } else { 0 },
-            terminals: match (agent, terminals) {
-                (Some(agent), _) => format!("{agent}'s rule"),
-                (None, 0) => "none: no row of this file is terminal".into(),
-                (None, n) => format!("learned from the {n} terminal rows"),
+            terminals: match (agent, terminals, known) {
+                (Some(agent), ..) => format!("{agent}'s rule"),
+                (None, 0, _) => "none: no row of this file is terminal".into(),
+                (None, n, 0) => format!("none: {n} rows are terminal, and none of them has a next state"),
+                (None, n, known) if known < n => {
+                    format!("learned from {known} of the {n} terminal rows, which have a next state")
+                }
+                (None, n, _) => format!("learned from the {n} terminal rows"),
             },
         }
     }

@@ -73,7 +73,7 @@ impl Learn {
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target, self.extra.as_deref(), &self.own)?;
-        let inputs = inputs.with_target_rows(config.target.rows);
+        let inputs = inputs.with_target_rows(config.target.rows)?;
         let comparison = if self.no_verdict { Comparison::Skip } else { Comparison::Recommend };
         let run = TrainingRun { config: &config, seeds: &seeds, own: &self.own, comparison, out: &out };
         output.print(&run.run(&inputs, device)?, render);

@@ -325,6 +325,26 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
         assert!(message(&other).contains(&expected), "{}", message(&other));
     };
     refuse("the results of a");
+
+    // Moved elsewhere, it is still done.
+    fs::rename(dir.path().join("whole"), dir.path().join("moved")).unwrap();
+    let again = tce(dir.path(), &args("moved"));
+    assert!(again.status.success() && message(&again).contains("done before"), "{}", message(&again));
+    fs::rename(dir.path().join("moved"), dir.path().join("whole")).unwrap();
+
+    // Interrupted after its trainings, none of them is done again.
+    let verdict = fs::read(dir.path().join("whole/verdict.json")).unwrap();
+    fs::remove_file(dir.path().join("whole/summary.json")).unwrap();
+    let again = tce(dir.path(), &args("whole"));
+    assert!(again.status.success(), "{}", message(&again));
+    assert_eq!(
+        message(&again).matches("learned before").count(),
+        2,
+        "the policy and the baseline: {}",
+        message(&again)
+    );
+    assert!(fs::read(dir.path().join("whole/verdict.json")).unwrap() == verdict);
+
     let results = ["policy-seed0.safetensors", "summary.json"].map(|file| dir.path().join("whole").join(file));
     let bytes = fs::read(&results[0]).unwrap();
     for lost in [&results[..1], &results[..]] {
@@ -335,4 +355,32 @@ fn a_learning_goes_on_where_it_stopped_and_refuses_another() {
         assert!(tce(dir.path(), &args("whole")).status.success());
         assert!(fs::read(&results[0]).unwrap() == bytes);
     }
+}
+
+#[test]
+fn policies_that_were_not_compared_are_compared_later() {
+    let dir = tempfile::tempdir().unwrap();
+    crate::common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
+    let call = ["learn", "--target", "target.hdf5", "--extra", "source.hdf5", "--out", "policies"];
+    let small =
+        ["--set=learner.steps=40", "--set=learner.batch=32", "--set=dynamics.steps=20", "--set=fitted_q.steps=20"];
+    let learn = |more: &[&str]| {
+        let output = tce(dir.path(), &[&call[..], &small[..], more].concat());
+        (output.status.code(), message(&output))
+    };
+    assert_eq!(learn(&["--no-verdict"]).0, Some(0));
+    let [policy, verdict] = ["policy-seed0.safetensors", "verdict.json"].map(|f| dir.path().join("policies").join(f));
+    let (bytes, written) = (fs::read(&policy).unwrap(), policy.metadata().unwrap().modified().unwrap());
+    assert!(!verdict.exists());
+    // The source helps to compare them and teaches them nothing.
+    let (code, said) = learn(&["--source", "source.hdf5"]);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("learned before") && verdict.exists(), "{said}");
+    assert!(fs::read(&policy).unwrap() == bytes && policy.metadata().unwrap().modified().unwrap() == written);
+    // Then it is done, with a verdict and without; another source would give another verdict.
+    for more in [&["--source", "source.hdf5"][..], &["--no-verdict"]] {
+        assert!(learn(more).1.contains("done before"), "{more:?}");
+    }
+    let (code, said) = learn(&[]);
+    assert_eq!(code, Some(2), "{said}");
 }

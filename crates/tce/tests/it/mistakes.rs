@@ -40,6 +40,8 @@ learn --target target.hdf5 --out notes.txt/out
 learn --target target.hdf5 --out out --learner dara
 learn --target target.hdf5 --source ant.hdf5 --out out
 learn --target target.hdf5 --extra target.hdf5 --out out
+learn --target target.hdf5 --out out --set target.rows=3
+learn --target target.hdf5 --out out --set learner.bc.actor.hidden=[256,0]
 augment --source target.hdf5 --target target.hdf5 --out wider.hdf5
 augment --source source.hdf5 --target ant.hdf5 --out wider.hdf5
 augment --source source.hdf5 --target target.hdf5 --out target.hdf5

@@ -99,6 +99,31 @@ fn every_variant_runs_and_leaves_its_specification() {
     assert!(filtered < whole && filtered > 0, "the filter rejects something, not all: {filtered}");
 }
 
+/// What a variant does not look at must not decide its result, whatever runs beside it.
+#[test]
+fn a_variant_alone_gives_what_it_gives_beside_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Kinematic);
+    let policy = |variants: &str, out: &str| {
+        let mut args = vec![
+            "run",
+            "hopper-kinematic:medium->medium",
+            "--no-baselines",
+            "--no-verdict",
+            "--variant",
+            variants,
+            "--out",
+            out,
+        ];
+        args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
+        args.extend(TINY);
+        let report = tce_json(dir.path(), &args);
+        let row = report["rows"].as_array().unwrap().iter().find(|r| r["variant"] == "simple-aug").unwrap();
+        fs::read(dir.path().join(row["directory"].as_str().unwrap()).join("policy-seed0.safetensors")).unwrap()
+    };
+    assert!(policy("simple-aug", "alone") == policy("tce-og,simple-aug", "beside"));
+}
+
 /// Every prior method and both of its modes, beside TCE's own rows under another learner.
 #[test]
 fn every_prior_method_runs_and_says_its_mode() {

@@ -8,7 +8,7 @@ use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
 use tce_learn::TerminalHandling;
 use tce_nn::Device;
-use tce_run::augment::{finisher, label_models, networks};
+use tce_run::augment::{finisher, label_models, networks, support};
 use tce_run::diagnosis::cycles::{Asked, AtCycle, Cycles, cycles};
 use tce_run::diagnosis::generator::{Consistency, Quality, Tried, consistency, hold_out, step_std};
 use tce_run::error::Result;
@@ -128,11 +128,12 @@ impl GeneratorArgs {
         }
         let config = self.config.layered(Some(self.task), None)?.config()?;
         let inputs =
-            Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows);
+            Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows)?;
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
         let inputs = inputs.with_target(training, hash);
-        let training = &inputs.target.rows;
+        let training = &*inputs.imitated(&config.target);
+        let support = support(&inputs, &config);
         let seeds = [self.seed];
         let (models, ..) = label_models(&inputs, &config.labels, &seeds, &self.data.out, device)?;
         let place = (self.task.agent, self.task.shift);
@@ -170,6 +171,7 @@ impl GeneratorArgs {
                 finisher: &finisher,
                 training,
                 held_out: &held_out,
+                support: support.as_ref(),
                 place,
             };
             for sampler in &samplers {

@@ -234,7 +234,7 @@ impl RunArgs {
                     out: run.root.clone(),
                 };
                 let inputs = Inputs::of_task(run.task, &data, Some(run.config.source.rows))?;
-                let inputs = inputs.with_target_rows(run.config.target.rows);
+                let inputs = inputs.with_target_rows(run.config.target.rows)?;
                 run.check(&inputs)?;
                 let subject = Subject {
                     of: directory.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
@@ -250,7 +250,7 @@ impl RunArgs {
                 let config = self.config.layered(None, Some(Variant::TceOg))?.config()?;
                 let target = self.target.as_deref().expect("clap asks for it");
                 let inputs = Inputs::of_files(self.source.as_deref(), target, None, &self.own)?;
-                let inputs = inputs.with_target_rows(config.target.rows);
+                let inputs = inputs.with_target_rows(config.target.rows)?;
                 let seed = self.seed.unwrap_or(0);
                 let subject = Subject {
                     of: target.display().to_string(),
