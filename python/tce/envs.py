@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, Union
 
 import numpy as np
@@ -110,14 +111,20 @@ def evaluate(
     return _one_by_one(policy, env, episodes, seed, deterministic)
 
 
+def _samples(seed: int, deterministic: bool) -> Iterator[tuple[int, int] | None]:
+    """What decides the sampled action of each call. The calls are counted from 0 here: the same evaluation gives the same returns again."""
+    return (None if deterministic else (seed, call) for call in count())
+
+
 def _one_by_one(policy: PolicyLike, env: Any, episodes: int, seed: int, deterministic: bool) -> Evaluation:
     returns, lengths = [], []
+    samples = _samples(seed, deterministic)
     for episode in range(episodes):
         observation, _ = env.reset(seed=seed if episode == 0 else None)
         total, steps, over, state, reward = 0.0, 0, False, None, None
         while not over:
             if isinstance(policy, Policy):
-                action, state = policy.predict(observation, state, None, deterministic, reward=reward, seed=seed)
+                action, state = policy._predict(observation, state, None, reward, next(samples))
             else:
                 action = np.asarray(policy(observation))
             observation, reward, terminated, truncated, _ = env.step(action)
@@ -138,9 +145,10 @@ def _in_lanes(policy: PolicyLike, env: Any, episodes: int, seed: int, determinis
     resetting = np.zeros(lanes, dtype=bool)
     mode = env.metadata.get("autoreset_mode", "NEXT_STEP")
     mode = getattr(mode, "name", mode)
+    samples = _samples(seed, deterministic)
     while any(len(done) < quota for done in per_lane):
         if isinstance(policy, Policy):
-            actions, state = policy.predict(observations, state, starts, deterministic, reward=rewards, seed=seed)
+            actions, state = policy._predict(observations, state, starts, rewards, next(samples))
         else:
             actions = np.stack([np.asarray(policy(o)) for o in observations])
         observations, rewards, terminated, truncated, _ = env.step(actions)

@@ -106,6 +106,21 @@ class Policy:
         action : ndarray of float32, shape (d_a,) or (N, d_a)
         state
         """
+        sample = None
+        if not deterministic:
+            sample = (seed, self._calls)
+            self._calls += 1
+        return self._predict(observation, state, episode_start, reward, sample)
+
+    def _predict(
+        self,
+        observation: npt.ArrayLike,
+        state: State,
+        episode_start: npt.ArrayLike | None,
+        reward: npt.ArrayLike | None,
+        sample: tuple[int, int] | None,
+    ) -> tuple[npt.NDArray[np.float32], State]:
+        """:meth:`predict`, where ``sample`` has the seed and the number of the call that decide a sampled action."""
         array = np.asarray(observation)
         batch = np.ascontiguousarray(np.atleast_2d(array), dtype=np.float32)
         memories: _tce.Memories = state if state is not None else self._policy.start(len(batch))
@@ -113,10 +128,6 @@ class Policy:
             memories.reward(self._policy, np.atleast_1d(np.asarray(reward, dtype=np.float64)))
         if state is not None and episode_start is not None:
             memories.restart(self._policy, np.atleast_1d(np.asarray(episode_start, dtype=bool)))
-        sample = None
-        if not deterministic:
-            sample = (seed, self._calls)
-            self._calls += 1
         actions = self._policy.act(batch, memories, sample)
         return (actions[0] if array.ndim == 1 else actions), memories
 

@@ -29,8 +29,8 @@ _REWARDS = ("rewards", "reward")
 _NEXT = ("next_observations", "next_obs", "next_states")
 _TERMINALS = ("terminals", "terminations", "terminated", "terminal")
 _TIMEOUTS = ("timeouts", "truncations", "truncated", "truncateds", "timeout")
-#: Of rows that came from a table of ours.
-_KNOWN = "known"
+#: Of rows that came from a table of ours, and from a file of ours.
+_KNOWN = ("known", "next_observations_known")
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ class Transitions:
     def __init__(self, table: _tce.Table) -> None:
         self._table = table
         columns = table.columns()
-        self.observations: npt.NDArray[np.float32] = columns.pop("observations")
-        self.actions: npt.NDArray[np.float32] = columns.pop("actions")
-        self.rewards: npt.NDArray[np.float32] = columns.pop("rewards")
-        self.next_observations: npt.NDArray[np.float32] = columns.pop("next_observations")
-        self.terminals: npt.NDArray[np.bool_] = columns.pop("terminals")
-        self.timeouts: npt.NDArray[np.bool_] = columns.pop("timeouts")
-        self.known: npt.NDArray[np.bool_] = columns.pop(_KNOWN)
-        self.extra_columns: dict[str, npt.NDArray[np.float32]] = columns
+        self.observations: npt.NDArray[np.float32] = columns["observations"]
+        self.actions: npt.NDArray[np.float32] = columns["actions"]
+        self.rewards: npt.NDArray[np.float32] = columns["rewards"]
+        self.next_observations: npt.NDArray[np.float32] = columns["next_observations"]
+        self.terminals: npt.NDArray[np.bool_] = columns["terminals"]
+        self.timeouts: npt.NDArray[np.bool_] = columns["timeouts"]
+        self.known: npt.NDArray[np.bool_] = columns["known"]
+        self.extra_columns: dict[str, npt.NDArray[np.float32]] = table.further()
 
     def __len__(self) -> int:
         return len(self._table)
@@ -133,7 +133,11 @@ class Transitions:
         return found
 
     def to_dict(self) -> dict[str, npt.NDArray[Any]]:
-        """All columns by D4RL's names; further ones behind them. The arrays are views."""
+        """All columns by D4RL's names; further ones behind them. The arrays are views.
+
+        ``known`` is among them where some s' was not logged, so that :func:`load` gives the same rows again. A further column that has
+        the name of one of these is left out.
+        """
         columns: dict[str, npt.NDArray[Any]] = {
             "observations": self.observations,
             "actions": self.actions,
@@ -142,7 +146,10 @@ class Transitions:
             "terminals": self.terminals,
             "timeouts": self.timeouts,
         }
-        return {**columns, **self.extra_columns}
+        # A further column of this name would be read as ours.
+        if not self.known.all() or "known" in self.extra_columns:
+            columns["known"] = self.known
+        return {**columns, **{name: column for name, column in self.extra_columns.items() if name not in columns}}
 
     def save(
         self, path: str | os.PathLike[str], format: str = "d4rl", *, minari_id: str | None = None, overwrite: bool = False
@@ -190,6 +197,7 @@ class Transitions:
         # The buffers take arrays, whatever their annotations say.
         buffer: Any = EpisodeBuffer
         buffers = []
+        truncations = self._truncations()
         for k, e in enumerate(self.episodes()):
             states = np.concatenate([self.observations[e.rows], self.next_observations[e.stop - 1 : e.stop]])
             buffers.append(
@@ -199,7 +207,7 @@ class Transitions:
                     actions=self.actions[e.rows],
                     rewards=self.rewards[e.rows].astype(np.float64).tolist(),
                     terminations=self.terminals[e.rows].tolist(),
-                    truncations=self.timeouts[e.rows].tolist(),
+                    truncations=truncations[e.rows].tolist(),
                 )
             )
         box = gymnasium.spaces.Box
@@ -212,16 +220,20 @@ class Transitions:
         """A ``d3rlpy.dataset.MDPDataset``. Needs ``d3rlpy``."""
         import d3rlpy
 
-        timeouts = np.logical_and(self.timeouts, np.logical_not(self.terminals))
-        # The last row ends its episode, whether or not it was marked.
-        timeouts[-1:] |= ~self.terminals[-1:]
         return d3rlpy.dataset.MDPDataset(
             observations=self.observations,
             actions=self.actions,
             rewards=self.rewards,
             terminals=self.terminals.astype(np.float32),
-            timeouts=timeouts.astype(np.float32),
+            timeouts=self._truncations().astype(np.float32),
         )
+
+    def _truncations(self) -> npt.NDArray[np.bool_]:
+        """Rows that end an episode without a terminal: what other libraries call truncated. No row is both."""
+        truncations = self.timeouts & ~self.terminals
+        # The last row ends its episode, whether or not it was marked.
+        truncations[-1:] |= ~self.terminals[-1:]
+        return truncations
 
     def to_arrow(self) -> Any:
         """A ``pyarrow.Table``: one list column a matrix, from where pandas and Polars read. Needs ``pyarrow``."""
@@ -263,8 +275,8 @@ def load(
     source : path, mapping of arrays, minari.MinariDataset, "minari:ID", h5py.File or Transitions
         A file of D4RL's, OTDF's, Minari's or robomimic's layout, or arrays by D4RL's names: ``observations`` (N, d_s), ``actions``
         (N, d_a), ``rewards`` (N,), ``terminals`` (N,), and where they were logged ``next_observations`` (N, d_s) and ``timeouts``
-        (N,). The names of gymnasium (``obs``, ``terminated``, ``truncated``, ...) are taken, too. Any number type and memory layout;
-        numbers become float32. Further columns of shape (N,) are kept.
+        (N,). The names of gymnasium (``obs``, ``terminated``, ``truncated``, ...) are taken, too. ``known`` (N,) is False at terminals
+        whose s' was not logged. Any number type and memory layout; numbers become float32. Further columns of shape (N,) are kept.
     env : str, optional
         The robot is this one of the benchmark's, as in ``"hopper-morph"``: its dimensions and its limit of 1000 steps apply.
     step_limit : int, optional
@@ -333,15 +345,15 @@ def _of_mapping(source: Mapping[str, Any], robot: Robot, name: str) -> Transitio
 
     keys = [field(names) for names in (_OBSERVATIONS, _ACTIONS, _REWARDS, _TERMINALS)]
     observations, actions, rewards, terminals = (str(key) for key in keys)
-    following, timeouts = field(_NEXT, needed=False), field(_TIMEOUTS, needed=False)
-    used = {observations, actions, rewards, terminals, following, timeouts, _KNOWN}
+    following, timeouts, known = (field(names, needed=False) for names in (_NEXT, _TIMEOUTS, _KNOWN))
+    used = {observations, actions, rewards, terminals, following, timeouts, *_KNOWN}
     rows = len(np.asarray(source[rewards]))
     further = {}
     for key in source:
         array = None if key in used else np.asarray(source[key])
         if array is not None and array.dtype.kind in "fiub" and array.shape in ((rows,), (rows, 1)):
             further[str(key)] = np.ascontiguousarray(array.reshape(-1), dtype=np.float32)
-    arrays = {
+    arrays: dict[str, Any] = {
         "observations": numbers(observations, 2),
         "actions": numbers(actions, 2),
         "rewards": numbers(rewards, 1),
@@ -350,8 +362,24 @@ def _of_mapping(source: Mapping[str, Any], robot: Robot, name: str) -> Transitio
         "timeouts": None if timeouts is None else flags(timeouts),
         "further": further,
     }
+    if following is not None and known is not None:
+        # Where s' is not known it is only a stand-in, which nothing may learn from.
+        arrays["next_observations"] = _with_gaps(arrays["next_observations"], flags(known), arrays["terminals"], f"{name}: field `{known}`")
     table = _tce.Table.of_arrays(Path(name), arrays, robot)
     return Transitions(table)
+
+
+def _with_gaps(
+    successors: npt.NDArray[np.float32], known: npt.NDArray[np.bool_], terminals: npt.NDArray[np.bool_], field: str
+) -> npt.NDArray[np.float32]:
+    """The successors with NaN where they are not ``known``, as the program takes them. The caller's array stays as it is."""
+    if len(known) != len(terminals):
+        raise DataError(f"{field}: found {len(known)} rows; expected {len(terminals)} rows, one per transition")
+    lost = np.flatnonzero(~known & ~terminals)
+    if len(lost):
+        raise DataError(f"{field}: found False in row {lost[0]}, which is no terminal; expected a next state there. Remove the row")
+    # The program refuses successors of another length in its own words.
+    return np.where(known[:, None], successors, np.float32(np.nan)) if len(successors) == len(known) else successors
 
 
 def _shaped(array: npt.NDArray[Any], ndim: int, name: str, key: str) -> npt.NDArray[Any]:

@@ -97,6 +97,33 @@ def test_a_trained_policy_in_an_own_environment():
     assert len(tce.evaluate(policy, arm.Arm(), episodes=2).returns) == 2
 
 
+def test_sampled_evaluations_repeat_by_their_seed():
+    class Sum(gymnasium.Env):
+        """Ten steps of a robot with the hopper's dimensions, whose start is always the same."""
+
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (11,), np.float32)
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            self.steps = 0
+            return np.zeros(11, np.float32), {}
+
+        def step(self, action):
+            self.steps += 1
+            return np.full(11, self.steps / 10, np.float32), float(action.sum()), False, self.steps == 10, {}
+
+    policy = tce.Policy.load("zoo:hopper-morph-expert")
+    for env in (Sum(), gymnasium.vector.SyncVectorEnv([Sum] * 2)):
+
+        def returns(seed, deterministic=False):
+            return tce.evaluate(policy, env, episodes=4, seed=seed, deterministic=deterministic).returns.tolist()
+
+        first = returns(1)
+        assert first == returns(1) and first != returns(2)
+        assert len(set(first)) == 4, "no episode repeats the actions of another"
+        assert len(set(returns(1, deterministic=True))) == 1
+
+
 def test_the_first_example_needs_the_package_alone():
     import arm
     import conftest

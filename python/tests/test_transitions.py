@@ -124,6 +124,70 @@ def test_pickles(target):
     assert again.report == data.report
 
 
+@pytest.fixture
+def stops(target):
+    """A log without successors: each second episode ends at a terminal, the others are cut, and the log stops within one."""
+    ends = np.flatnonzero(target["timeouts"])
+    columns = {name: column[:290].copy() for name, column in target.items() if name != "next_observations"}
+    columns["terminals"][ends[::2]], columns["timeouts"][ends[::2]] = True, False
+    return columns
+
+
+def test_unknown_successors_stay_unknown(stops):
+    data = tce.load(stops)
+    assert (~data.known).sum() == 6, "all terminals"
+    columns = data.to_dict()
+    given = {name: column.copy() for name, column in columns.items()}
+    again = tce.load(given)
+    for name in ("known", "observations", "next_observations", "terminals", "timeouts"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(data, name), err_msg=name)
+        np.testing.assert_array_equal(given[name], columns[name], err_msg=f"{name} is the caller's")
+    assert again.extra_columns == {} and again.report["unknown_successors"] == 6
+    named = {"known": "next_observations_known"}
+    other = tce.load({named.get(name, name): column for name, column in given.items()})
+    np.testing.assert_array_equal(other.known, data.known)
+
+
+def test_known_is_a_column_only_where_it_tells_something(target, stops):
+    assert "known" not in tce.load(target).to_dict()
+    arrow = pytest.importorskip("pyarrow")
+    table = tce.load(stops).to_arrow()
+    assert table.schema.field("known").type == arrow.bool_()
+    assert table["known"].to_pylist().count(False) == 6
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (np.arange(300) != 3, "field `known`: found False in row 3, which is no terminal"),
+        (np.ones(299, bool), "field `known`: found 299 rows; expected 300 rows"),
+        (np.full(300, 0.5), "field `known`: .* truth values"),
+    ],
+)
+def test_wrong_marks_of_successors_are_refused(target, known, words):
+    with pytest.raises(tce.DataError, match=words):
+        tce.load({**target, "known": known})
+
+
+def test_a_further_column_does_not_take_the_place_of_an_own_one(target, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    path = tce.load(target).save(tmp_path / "log.hdf5")
+    with h5py.File(path, "r+") as file:
+        file["known"] = np.arange(300, dtype=np.float32)
+    data = tce.load(path)
+    for again in (data, pickle.loads(pickle.dumps(data)), tce.load(data.save(tmp_path / "again.hdf5"))):
+        assert again.known.dtype == bool and again.known.all()
+        np.testing.assert_array_equal(again.extra_columns["known"], np.arange(300))
+    again = tce.load(data.to_dict())
+    assert again.known.all() and again.extra_columns == {}
+
+
+def test_a_limit_of_no_steps_is_refused(target):
+    for call in (lambda: tce.load(target, step_limit=0), lambda: tce.load(target).describe(step_limit=0)):
+        with pytest.raises(tce.ConfigError, match="^step_limit: found 0, expected at least 1$"):
+            call()
+
+
 def test_findings(target):
     assert tce.check(target) == []
     twice = {name: np.concatenate([column, column]) for name, column in target.items()}
@@ -144,6 +208,21 @@ def test_minari_there_and_back(target, tmp_path, monkeypatch):
         np.testing.assert_array_equal(again.timeouts, data.timeouts)
     written = data.save(tmp_path / "lab" / "other-v0", "minari", minari_id="lab/other-v0")
     assert isinstance(written, Path) and minari.load_dataset("lab/other-v0").total_steps == 300
+
+
+def test_minaris_episodes_end_in_one_way(target, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    # The first episode ends at a terminal that is marked as cut, too; the log stops within the last one.
+    columns = {name: column[:290].copy() for name, column in target.items()}
+    columns["terminals"][24] = True
+    dataset = tce.load(columns).to_minari("lab/cut-v0")
+    episodes = list(minari.load_dataset("lab/cut-v0").iterate_episodes())
+    assert dataset.total_steps == 290 and [len(e.rewards) for e in episodes] == [25] * 11 + [15]
+    for k, episode in enumerate(episodes):
+        last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
+        np.testing.assert_array_equal(episode.terminations, last & (k == 0))
+        np.testing.assert_array_equal(episode.truncations, last & (k > 0))
 
 
 def test_other_libraries(target):

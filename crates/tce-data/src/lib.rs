@@ -6,6 +6,7 @@
 //! | Where does it come from? | [`load`]: HDF5 in OTDF's or D4RL's layout, validated before use, with a [`LoadReport`] |
 //! | And from memory? | [`from_columns`], with the same checks |
 //! | Where does it go? | [`save_d4rl`]: D4RL's layout with `next_observations`, atomically |
+//! | Which rows does the next row continue? | [`continued`] |
 //! | What is in it? | [`inspect`], [`check`](check()), [`infer_agents`], [`ensure_same_agent`] |
 //! | In which units does a network see it? | [`Standardizer`] |
 //! | How good is a return? | [`reference_scores`], [`ReferenceScores::normalised_score`] |
@@ -67,8 +68,8 @@ pub use check::{Check, Finding, Severity, check};
 pub use density::{DensityOptions, DensityScale, DensityScores, density_scores, further_scores};
 pub use error::{DataError, Problem};
 pub use files::{
-    Columns, Dropped, EpisodeEnds, Layout, LoadOptions, LoadReport, Loaded, Successors, from_columns, load, main_file,
-    read_attributes, save_d4rl, save_minari,
+    Columns, Dropped, EpisodeEnds, Layout, LoadOptions, LoadReport, Loaded, Successors, continued, from_columns, load,
+    main_file, read_attributes, save_d4rl, save_minari,
 };
 pub use filter::{largest_z, zscore_keep};
 pub use held_out::{fold_of_runs, hold_out_runs};

@@ -65,6 +65,9 @@ impl Robot {
     pub fn own(&self) -> Result<Own> {
         let env = self.env.as_deref().map(parse_environment).transpose();
         let range = self.action_range.as_deref().map(parse_range).transpose();
+        if self.step_limit == Some(0) {
+            return Err(Error::Usage("step_limit: found 0, expected at least 1".to_owned()));
+        }
         Ok(Own {
             env: env.map_err(|e| Error::Usage(format!("env: {e}")))?,
             step_limit: self.step_limit,

@@ -161,7 +161,7 @@ impl Table {
         self.report.as_deref()
     }
 
-    /// All columns by their names, as read-only views.
+    /// The table's own columns by their names, as read-only views.
     fn columns<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
         let (table, columns) = (this.get(), PyDict::new(this.py()));
         let t = &table.rows;
@@ -172,7 +172,13 @@ impl Table {
         columns.set_item("terminals", vector(this, &t.terminals))?;
         columns.set_item("timeouts", vector(this, &t.timeouts))?;
         columns.set_item("known", vector(this, &t.known))?;
-        for (name, values) in &table.columns {
+        Ok(columns)
+    }
+
+    /// The further columns. They are apart, because a file may have one that is called as one of the table's own.
+    fn further<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
+        let columns = PyDict::new(this.py());
+        for (name, values) in &this.get().columns {
             columns.set_item(name, vector(this, values))?;
         }
         Ok(columns)

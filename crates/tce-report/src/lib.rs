@@ -35,7 +35,7 @@ pub use analysis::{Analysis, Options, analyse};
 pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use merge::merge;
+pub use merge::{merge, mixed};
 pub use study::{Budget, Change, Cost, Method, Missing, Recipe, Recommended, Run, Study};
 
 use std::path::{Path, PathBuf};

@@ -5,12 +5,12 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use tce_data::Task;
 
-use crate::folder::Verdict;
+use crate::folder::{RunFolder, Verdict};
 use crate::study::{Method, Missing, Run, Study};
 
 /// All of `studies` as one, in their order. A run that several of them have counts once. Where they differ about a run of the same
-/// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings or data for a method,
-/// task and seed, each of them has a column of its own.
+/// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings or data for a method
+/// and task, each of them has a column of its own.
 ///
 /// # Panics
 /// If there is none.
@@ -169,14 +169,10 @@ impl Merging {
         }
     }
 
-    /// Gives every study a column of its own where several have runs of one method, task and seed that are different work.
+    /// Gives every study a column of its own where their runs of one method and task are different work.
     fn split(&mut self) {
-        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
-        let twice: BTreeSet<String> = (self.out.runs.iter())
-            .filter(|r| !seen.insert((r.task, &r.method, r.member.seed)))
-            .map(|r| r.method.clone())
-            .collect();
-        for id in twice {
+        let runs = self.out.runs.iter();
+        for id in mixed(runs.map(|r| (r.task, r.method.as_str(), &*r.folder, r.member.seed))) {
             let at = self.out.methods.iter().position(|m| m.id == id).expect("every run has a method");
             let method = self.out.methods.remove(at);
             let mut columns = 0;
@@ -199,6 +195,20 @@ impl Merging {
             add_new(&mut self.out.notes, [note]);
         }
     }
+}
+
+/// The names of which some task has runs that are no seeds of one work: they have other settings or other data, or a seed is there twice.
+pub fn mixed<'a>(runs: impl IntoIterator<Item = (Task, &'a str, &'a RunFolder, u64)>) -> BTreeSet<String> {
+    let mut seen: BTreeMap<(Task, &str), (&RunFolder, BTreeSet<u64>)> = BTreeMap::new();
+    let mut mixed = BTreeSet::new();
+    for (task, name, folder, seed) in runs {
+        let (first, seeds) = seen.entry((task, name)).or_insert_with(|| (folder, BTreeSet::new()));
+        let same = (&first.config_hash, &first.inputs) == (&folder.config_hash, &folder.inputs);
+        if !seeds.insert(seed) || !same {
+            mixed.insert(name.to_owned());
+        }
+    }
+    mixed
 }
 
 /// Those of `more` that `known` does not have yet.

@@ -1,17 +1,17 @@
 //! What a report is made from: sweeps' folders, folders with runs of `tce run`, and records of either.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use serde_json::Value;
-use tce_base::FileError;
+use tce_base::{FileError, sha256_hex};
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
 use tce_learn::Mode;
 use tce_report::folder::Verdict;
-use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, record};
+use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, mixed, record};
 
 use crate::config::Config;
 use crate::diagnosis;
@@ -315,30 +315,24 @@ fn of_runs(directory: &Path) -> Result<Study> {
     Ok(study)
 }
 
-/// The column of every finished run: its name. Where a task has two runs of one name and seed, they differ in their settings or
-/// their data, and every setting, or else every folder, of that name is a column of its own.
+/// The column of every finished run: its name. Where a task has runs of one name that are no seeds of one work, they differ in their
+/// settings or their data, and all settings, all data, or else all folders of that name are columns of their own.
 fn columns(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
     let mut ids: Vec<String> = finished.iter().map(|(_, name, _)| name.clone()).collect();
-    let marks: [fn(&RunFolder) -> String; 2] = [
+    let marks: [fn(&RunFolder) -> String; 3] = [
         |f| f.config_hash[..6].to_owned(),
+        |f| sha256_hex(serde_json::json!(f.inputs).to_string().as_bytes())[..6].to_owned(),
         |f| name_of(&f.directory).rsplit('-').next().unwrap_or_default().to_owned(),
     ];
     for mark in marks {
-        let mut seen: BTreeSet<(Task, &str, u64)> = BTreeSet::new();
-        let mut twice: BTreeSet<String> = BTreeSet::new();
-        for ((of, name, folder), id) in finished.iter().zip(&ids) {
-            for member in &folder.members {
-                if !seen.insert((*of, id, member.seed)) {
-                    twice.insert(name.clone());
-                }
-            }
-        }
-        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|((_, name, _), _)| twice.contains(name)) {
-            *id = format!("{name} {}", mark(folder));
-        }
-        for name in twice {
+        let members = finished.iter().zip(&ids).flat_map(|((of, _, folder), id)| {
+            folder.members.iter().map(move |member| (*of, id.as_str(), folder, member.seed))
+        });
+        let mixed = mixed(members);
+        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|(_, id)| mixed.contains(*id)) {
+            *id = format!("{id} {}", mark(folder));
             let note = format!(
-                "{name}: a task has several runs of one seed with different settings or data; each is a column of its own."
+                "{name}: a task has several runs with different settings or data; each is a column of its own."
             );
             if !notes.contains(&note) {
                 notes.push(note);

@@ -14,6 +14,7 @@ use super::marks::{Resolved, Table};
 use super::report::{EpisodeEnds, Successors};
 use super::rows::tell;
 use super::steps::{Steps, doubts, in_place};
+use crate::Transitions;
 
 /// Largest number of interleaved environments (one row of each per step) that is searched for.
 const MOST_ENVIRONMENTS: usize = 1024;
@@ -109,6 +110,19 @@ pub(super) fn has_unmarked_ends(table: &Table<'_>) -> bool {
     let continuity = Continuity { table, next, tolerance: &tolerance };
     let last = table.terminals.len() - 1;
     (0..last).into_par_iter().any(|i| !table.terminals[i] && !timeouts[i] && !continuity.joined(i, 1))
+}
+
+/// For every row, whether the next row continues it: no mark ends the episode, and the next row's state is s' up to
+/// rounding, as when a file is read. The marks alone do not tell it: where a file without `timeouts` stores its
+/// successors in another way, ends of episodes stay unmarked, and s' is not the next row's state.
+pub fn continued(t: &Transitions) -> Vec<bool> {
+    let table = Table::of(t, None);
+    let Some(next) = table.next_observations else { return Vec::new() };
+    let tolerance = tolerance(&table);
+    let mut joined = Continuity { table: &table, next, tolerance: &tolerance }.all();
+    let ended = t.terminals.iter().zip(&t.timeouts).map(|(terminal, timeout)| *terminal || *timeout);
+    joined.iter_mut().zip(ended).for_each(|(joined, ended)| *joined &= !ended);
+    joined
 }
 
 /// Decides where episodes end and which successors are known. The rows must be in order.

@@ -64,7 +64,7 @@ pub(super) fn finish(raw: Raw, path: &Path, options: &LoadOptions) -> Result<Loa
     let summary = match layout {
         Layout::Otdf | Layout::D4rl => settle(&mut transitions, &mut columns, options.step_limit, &mut warnings),
         // The file is ours, but someone has changed it: it is treated like any other.
-        Layout::Tce if options.distrust_own && episodes::has_unmarked_ends(&table(&transitions, None)) => {
+        Layout::Tce if options.distrust_own && episodes::has_unmarked_ends(&Table::of(&transitions, None)) => {
             settle(&mut transitions, &mut columns, options.step_limit, &mut warnings)
         }
         // In these layouts, marks and successors are right by construction.
@@ -155,8 +155,8 @@ fn settle(
     warnings: &mut Vec<String>,
 ) -> Summary {
     let rows = t.len();
-    let mut tolerance = episodes::tolerance(&table(t, limit));
-    let environments = episodes::environments(&table(t, limit), &tolerance);
+    let mut tolerance = episodes::tolerance(&Table::of(t, limit));
+    let environments = episodes::environments(&Table::of(t, limit), &tolerance);
     if environments > 1 {
         warnings.push(format!(
             "the rows of {environments} environments take turns (s' is the state {environments} rows later): they were put one environment \
@@ -164,9 +164,9 @@ fn settle(
         ));
         reorder(t, columns, &episodes::untangled(rows, environments));
         // Once the rows are in order, the distances between them have changed.
-        tolerance = episodes::tolerance(&table(t, limit));
+        tolerance = episodes::tolerance(&Table::of(t, limit));
     }
-    let mut out = episodes::resolve(&table(t, limit), &tolerance, environments);
+    let mut out = episodes::resolve(&Table::of(t, limit), &tolerance, environments);
     // Successors that the file marks as unknown stay unknown.
     out.known.iter_mut().zip(&t.known).for_each(|(known, said)| *known &= said);
     warnings.extend(out.warnings);
@@ -181,17 +181,6 @@ fn settle(
     (t.timeouts, t.known) = (out.timeouts, out.known);
     retain(t, columns, &out.keep);
     Summary { environments, ends: out.ends, successors: out.successors, dropped: out.dropped }
-}
-
-fn table(t: &Transitions, limit: Option<usize>) -> Table<'_> {
-    Table {
-        dim: t.obs_dim,
-        observations: &t.observations,
-        next_observations: (!t.next_observations.is_empty()).then_some(&t.next_observations[..]),
-        terminals: &t.terminals,
-        timeouts: (!t.timeouts.is_empty()).then_some(&t.timeouts[..]),
-        limit,
-    }
 }
 
 fn reorder(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, order: &[usize]) {

@@ -1,6 +1,7 @@
 //! The marks of a file's rows, and the decisions made from them.
 
 use super::report::{Dropped, EpisodeEnds, Successors};
+use crate::Transitions;
 
 /// What a file says about each row, before any row is dropped.
 pub(super) struct Table<'a> {
@@ -12,6 +13,20 @@ pub(super) struct Table<'a> {
     pub timeouts: Option<&'a [bool]>,
     /// Number of steps after which the collector cut an episode.
     pub limit: Option<usize>,
+}
+
+impl<'a> Table<'a> {
+    /// What `t` says of its rows. A column without numbers is one that the file does not have.
+    pub fn of(t: &'a Transitions, limit: Option<usize>) -> Self {
+        Self {
+            dim: t.obs_dim,
+            observations: &t.observations,
+            next_observations: (!t.next_observations.is_empty()).then_some(&t.next_observations[..]),
+            terminals: &t.terminals,
+            timeouts: (!t.timeouts.is_empty()).then_some(&t.timeouts[..]),
+            limit,
+        }
+    }
 }
 
 /// The decisions made from a `Table`.

@@ -31,6 +31,7 @@ mod steps;
 mod successors;
 
 pub use columns::from_columns;
+pub use episodes::continued;
 pub use formats::Columns;
 pub use load::{Loaded, load, read_attributes};
 pub use minari::main_file;

@@ -7,7 +7,7 @@ use hdf5_pure::FileBuilder;
 use proptest::prelude::*;
 use rand::RngExt;
 use tce_base::Streams;
-use tce_data::{Dropped, EpisodeEnds, LoadOptions, Loaded, Successors, Transitions, save_d4rl};
+use tce_data::{Dropped, EpisodeEnds, LoadOptions, Loaded, Successors, Transitions, continued, save_d4rl};
 
 const EPISODES: usize = 20;
 const LENGTH: usize = 100;
@@ -250,6 +250,30 @@ fn rounded_successors_do_not_end_episodes() {
             "{digits} digits"
         );
     }
+}
+
+#[test]
+fn rows_are_continued_up_to_rounding_where_no_mark_ends_them() {
+    let mut walks = Walks::new();
+    walks.next.as_mut().unwrap().iter_mut().for_each(|x| *x = (*x * 1e3).round() / 1e3);
+    let mut t = walks.read().transitions;
+    let mut expected: Vec<bool> = (0..ROWS).map(|i| i % LENGTH != LENGTH - 1).collect();
+    assert_eq!(continued(&t), expected);
+    t.timeouts.fill(false);
+    t.terminals[7] = true;
+    expected[7] = false;
+    assert_eq!(continued(&t), expected, "the states tell the ends, too");
+    assert!(continued(&Transitions::new(3, 2)).is_empty());
+}
+
+/// Without `timeouts` nothing marks the ends of such a file, and the next row's action is not one at s'.
+#[test]
+fn successors_stored_in_another_way_are_not_the_next_row() {
+    let mut walks = Walks { timeouts: None, ..Walks::new() };
+    walks.next.as_mut().unwrap().iter_mut().step_by(3).for_each(|x| *x = 70.0);
+    let t = walks.read().transitions;
+    assert!(!t.timeouts.contains(&true));
+    assert!(!continued(&t).contains(&true));
 }
 
 #[test]

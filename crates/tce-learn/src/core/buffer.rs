@@ -9,12 +9,12 @@
 //!
 //! Member m draws the rows of step t from its stream `batch`, index t. A run resumed at t draws the same rows.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use tce_base::Streams;
-use tce_data::{Standardizer, Transitions};
+use tce_data::{Standardizer, Transitions, continued};
 use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{Device, Tensor, tensor};
 
@@ -49,6 +49,8 @@ pub struct Buffer {
     stream: &'static str,
     /// The step from which on batches hold target rows alone.
     fade: Option<u64>,
+    /// [`continued`] of every member's parts, from the first call of [`Buffer::next_actions`] on.
+    continued: OnceLock<Vec<Vec<Vec<bool>>>>,
 }
 
 /// The origin of a batch entry.
@@ -163,7 +165,8 @@ impl Buffer {
         // A dimension that is constant in the data of every member would only cost time (Ant's 84 contact slots).
         let live = |d: &usize| members.iter().any(|m| !m.standardizer.dead.contains(d));
         let inputs = (0..dims.0).filter(live).collect();
-        Ok(Self { members, batch, inputs, act_dim: dims.1, stream: "batch", fade: None })
+        let (stream, continued) = ("batch", OnceLock::new());
+        Ok(Self { members, batch, inputs, act_dim: dims.1, stream, fade: None, continued })
     }
 
     /// The same with batches from another stream: two learners with one seed must not draw the same rows at every step.
@@ -193,7 +196,8 @@ impl Buffer {
         let inputs = (0..dims.0).filter(|d| !standardizer.dead.contains(d)).collect();
         let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
         let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
-        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream: "batch", fade: None }
+        let (stream, continued) = ("batch", OnceLock::new());
+        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream, fade: None, continued }
     }
 
     /// The table of a replay buffer, to add rows to.
@@ -201,6 +205,8 @@ impl Buffer {
     /// # Panics
     /// If the table of the first member is shared.
     pub fn replay_mut(&mut self) -> &mut Transitions {
+        // The rows will change.
+        self.continued.take();
         Arc::get_mut(&mut self.members[0].parts[0]).expect("a replay table has one owner")
     }
 
@@ -275,15 +281,17 @@ impl Buffer {
     }
 
     /// The actions of the next rows `[P, B, d_a]`, and 1 if the data contain them, else 0, `[P, B, 1]`. The next row
-    /// must belong to the same episode and start where this row ends. Generated rows have no next row.
+    /// must belong to the same episode and start where this row ends, up to rounding ([`continued`]). Generated rows have
+    /// no next row.
     pub fn next_actions(&self, batch: &Minibatch) -> (Tensor<3>, Tensor<3>) {
         let [p, b, a] = batch.a.dims();
         let (mut actions, mut known) = (vec![0.0; p * b * a], vec![0.0; p * b]);
+        let of = |m: &Member| m.parts.iter().map(|part| continued(part)).collect();
+        let continued = self.continued.get_or_init(|| self.members.iter().map(of).collect());
         for (k, pick) in batch.picks.iter().enumerate() {
-            let (part, i) = (&self.members[k / b].parts[pick.part as usize], pick.row as usize);
-            let ended = part.terminals[i] || part.timeouts[i] || i + 1 == part.len();
-            if !ended && part.next_observation(i) == part.observation(i + 1) {
-                actions[k * a..(k + 1) * a].copy_from_slice(part.action(i + 1));
+            let (member, part, i) = (k / b, pick.part as usize, pick.row as usize);
+            if continued[member][part][i] {
+                actions[k * a..(k + 1) * a].copy_from_slice(self.members[member].parts[part].action(i + 1));
                 known[k] = 1.0;
             }
         }

@@ -1,5 +1,6 @@
 //! Integration tests of `tce-learn`, in one binary: linking each file separately takes longer than the tests.
 
+mod buffer;
 mod common;
 mod import;
 mod labels;

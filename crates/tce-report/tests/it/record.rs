@@ -115,6 +115,14 @@ fn other_settings_and_other_methods_of_one_name_are_columns_of_their_own() {
     assert_eq!(ids(&both), ["bc (demo)", "bc (mine)", "tce-og", "tce-og (mine)"]);
     assert_eq!((both.runs[6].method.as_str(), both.runs[7].method.as_str()), ("bc (mine)", "tce-og (mine)"));
     assert!(both.notes[0].starts_with("bc: several studies have it"), "{:?}", both.notes);
+    // Of other seeds, too: they are no further seeds of the same work.
+    let mut late = one_task(&root.path().join("c"), &[]);
+    late.methods = vec![method("bc", "BC", true)];
+    late.name = "late".into();
+    let directory = root.path().join("c/bc");
+    write_folder(&directory, &[(7, Some(50.0))], "a = 3\n");
+    add(&mut late, hopper(), "bc", &directory);
+    assert_eq!(ids(&merge(vec![first.clone(), late]))[..2], ["bc (demo)", "bc (late)"]);
     // The record of a study beside it changes nothing.
     let record = read_again(&other, &root.path().join("mine.jsonl"));
     let three = merge(vec![first, other, record]);

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -39,6 +39,17 @@ impl Sweep {
     /// # Errors
     /// If a process cannot be started, or the user interrupts; the processes are then given the time to write their checkpoints.
     pub fn launch_here(&self, share: Share) -> Result<usize> {
+        let mut running = BTreeMap::new();
+        let failed = self.share_out(share, &mut running);
+        // Nobody would wait for them, and a second launch would compete with them.
+        stop(running);
+        failed
+    }
+
+    /// Starts processes and waits for them, until nothing is left to do; those that are `running` at an error are the caller's.
+    fn share_out(&self, share: Share, running: &mut BTreeMap<usize, Child>) -> Result<usize> {
+        // Once: the program may be replaced on the way.
+        let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let mut todo: BTreeSet<usize> = self.missing()?.iter().map(|e| e.index).collect();
         let headline = Arc::new(Mutex::new(String::new()));
         let shown = headline.clone();
@@ -49,11 +60,10 @@ impl Sweep {
         let mut tries: BTreeMap<usize, usize> = BTreeMap::new();
         // The last message of each piece: one that fails twice in the same words fails a third time, too.
         let mut messages: BTreeMap<usize, String> = BTreeMap::new();
-        let mut running: BTreeMap<usize, Child> = BTreeMap::new();
         let mut failed = 0;
         while !(todo.is_empty() && running.is_empty()) {
             if interrupted() {
-                return Err(stop(running));
+                return Err(Error::interrupted());
             }
             while running.len() < share.workers.max(1) {
                 // What it needs is done, or has failed: then it tries by itself.
@@ -62,7 +72,7 @@ impl Sweep {
                 };
                 let Some(&next) = todo.iter().find(ready) else { break };
                 todo.remove(&next);
-                running.insert(next, self.start(&self.entries()[next], share)?);
+                running.insert(next, self.start(&program, &self.entries()[next], share)?);
             }
             // Every record is read for it, so not at every turn.
             if looked.is_none_or(|at| at.elapsed() > LOOK) {
@@ -73,7 +83,7 @@ impl Sweep {
             }
             std::thread::sleep(Duration::from_millis(50));
             let mut ended = Vec::new();
-            for (&index, child) in &mut running {
+            for (&index, child) in running.iter_mut() {
                 let status = child.try_wait().map_err(|e| Error::Failed(format!("cannot wait for a process: {e}")))?;
                 if let Some(status) = status {
                     ended.push((index, status));
@@ -103,6 +113,9 @@ impl Sweep {
                 if again && *tries <= share.retries {
                     todo.insert(index);
                 } else {
+                    if words.is_none() {
+                        self.note_failure(entry, &reason)?;
+                    }
                     failed += 1;
                     progress.inc(1);
                 }
@@ -116,13 +129,13 @@ impl Sweep {
         self.file("logs", &format!("{}.log", entry.id))
     }
 
-    fn start(&self, entry: &Entry, share: Share) -> Result<Child> {
+    fn start(&self, program: &Path, entry: &Entry, share: Share) -> Result<Child> {
+        self.forget_failure(entry);
         let path = self.log(entry);
         let directory = self.directory.join("logs");
         fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
         let log = File::options().create(true).append(true).open(&path);
         let log = log.map_err(|e| FileError::new(&path, "open", e))?;
-        let program = std::env::current_exe().map_err(|e| Error::Failed(format!("cannot find this program: {e}")))?;
         let mut command = Command::new(program);
         command.args(["--threads", &share.threads.to_string(), "--save-every", &share.save_every.to_string()]);
         command.args(["--device", &share.device.to_string()]);
@@ -146,7 +159,10 @@ fn headline_of(done: usize, running: usize, all: usize, left: Option<f64>) -> St
 }
 
 /// Asks the processes to stop at their next safe point, and waits for them.
-fn stop(running: BTreeMap<usize, Child>) -> Error {
+fn stop(running: BTreeMap<usize, Child>) {
+    if running.is_empty() {
+        return;
+    }
     tce_base::note!("stopping {} processes at their next checkpoint ...", running.len());
     for child in running.values() {
         terminate(child);
@@ -154,7 +170,6 @@ fn stop(running: BTreeMap<usize, Child>) -> Error {
     for (_, mut child) in running {
         let _ = child.wait();
     }
-    Error::interrupted()
 }
 
 #[cfg(unix)]

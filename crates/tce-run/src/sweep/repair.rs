@@ -8,7 +8,7 @@ use std::path::Path;
 
 use tce_base::FileError;
 
-use super::work::{Failure, Outcome, now};
+use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
 use crate::error::{Error, Result};
 
@@ -61,7 +61,7 @@ impl Sweep {
             let record = self.file("done", &format!("{}.json", entry.id));
             move_aside(&record)?;
             let error = format!("it was done, and is to be done again: {why}");
-            tce_base::write_json(&self.file("failed", &format!("{}.json", entry.id)), &Failure { error, at: now() })?;
+            self.note_failure(entry, &error)?;
             taken.push(format!("{entry}: {why}"));
         }
         Ok(taken)

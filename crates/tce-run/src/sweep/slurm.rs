@@ -169,6 +169,7 @@ impl Sweep {
                 let job = match options.dry_run {
                     true => None,
                     false => {
+                        elements.iter().flatten().for_each(|&index| self.forget_failure(&self.entries()[index]));
                         fs::create_dir_all(directory.join("logs"))
                             .map_err(|e| tce_base::FileError::new(&directory, "create a directory in", e))?;
                         let lines = elements.iter().fold(String::new(), |mut text, indices| {

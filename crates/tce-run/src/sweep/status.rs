@@ -2,13 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
+use tce_base::Owner;
 
-use super::work::{Active, Failure, now};
-use super::{Entry, Kind, Sweep};
+use super::work::{Active, now};
+use super::{Kind, Sweep};
 use crate::error::{Error, Result};
 
 /// A process without a heartbeat for so long counts as lost.
@@ -158,17 +159,14 @@ impl Sweep {
             let silent = SystemTime::now().duration_since(modified).is_ok_and(|d| d > SILENCE);
             let name = file.file_name().to_string_lossy().into_owned();
             let active = fs::read(file.path()).ok().and_then(|b| serde_json::from_slice::<Active>(&b).ok());
-            if let (false, Some((id, _)), Some(active)) = (silent, name.split_once('.'), active) {
+            let Some((id, owner)) = name.split_once('.') else { continue };
+            // Of a process of this machine it is known at once.
+            let lost = silent || Owner::of(Path::new(owner)).is_some_and(|owner| owner.dead());
+            if let (false, Some(active)) = (lost, active) {
                 out.entry(id.to_owned()).or_default().push(active);
             }
         }
         out
-    }
-
-    /// Why a piece of work failed the last time, if it did.
-    pub fn failure(&self, entry: &Entry) -> Option<Failure> {
-        let bytes = fs::read(self.file("failed", &format!("{}.json", entry.id))).ok()?;
-        serde_json::from_slice(&bytes).ok()
     }
 }
 

@@ -174,19 +174,38 @@ impl Sweep {
         if let Some(outcome) = self.outcome(entry)? {
             return Ok(outcome);
         }
-        if let Some(change) = self.changed_input(entry) {
-            return Err(Error::Failed(change));
-        }
         let beat = Heartbeat::start(self.file("active", &format!("{}.{}.json", entry.id, Owner::this())))?;
-        let outcome = self.compute(entry, device).and_then(|outcome| self.settle(outcome));
+        self.forget_failure(entry);
+        let outcome = match self.changed_input(entry) {
+            Some(change) => Err(Error::Failed(change)),
+            None => self.compute(entry, device).and_then(|outcome| self.settle(outcome)),
+        };
         drop(beat);
-        let failed = self.file("failed", &format!("{}.json", entry.id));
         match &outcome {
-            Ok(_) => drop(fs::remove_file(failed)),
-            Err(e) if e.exit_code() == 130 => {}
-            Err(e) => write_json(&failed, &Failure { error: e.to_string(), at: now() })?,
+            Err(e) if e.exit_code() != 130 => self.note_failure(entry, &e.to_string())?,
+            _ => {}
         }
         outcome
+    }
+
+    fn failure_file(&self, entry: &Entry) -> PathBuf {
+        self.file("failed", &format!("{}.json", entry.id))
+    }
+
+    /// Stores why a piece of work failed.
+    pub(super) fn note_failure(&self, entry: &Entry, error: &str) -> Result<()> {
+        Ok(write_json(&self.failure_file(entry), &Failure { error: error.to_owned(), at: now() })?)
+    }
+
+    /// Removes the reason of an earlier failure: the piece of work is tried again, and may fail for another.
+    pub(super) fn forget_failure(&self, entry: &Entry) {
+        let _ = fs::remove_file(self.failure_file(entry));
+    }
+
+    /// Why a piece of work failed the last time, if it did.
+    pub fn failure(&self, entry: &Entry) -> Option<Failure> {
+        let bytes = fs::read(self.failure_file(entry)).ok()?;
+        serde_json::from_slice(&bytes).ok()
     }
 
     fn compute(&self, entry: &Entry, device: &Device) -> Result<Outcome> {

@@ -4,7 +4,7 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Child, Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use crate::common::sweeps::{SETS, describe, outcomes};
@@ -188,6 +188,59 @@ fn a_failure_is_kept_and_the_rest_is_done() {
     let text = String::from_utf8_lossy(&shown.stdout);
     assert!(text.contains("3 failed") && text.contains("what failed keeps the sweep from its end"), "{text}");
     assert_eq!(text.matches("z_threshold").count(), 1, "equal messages are one: {text}");
+}
+
+#[test]
+fn a_sweep_whose_workers_are_killed_has_failed_and_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = describe(dir.path(), "s", 1);
+    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "doomed"]).status.success());
+    // What went wrong yesterday is no reason of today's failures.
+    let manifest = fs::read_to_string(dir.path().join("doomed/manifest.jsonl")).unwrap();
+    let pieces = manifest.lines().filter_map(|line| {
+        let entry: serde_json::Value = serde_json::from_str(line).unwrap();
+        entry["id"].as_str().map(str::to_owned)
+    });
+    fs::create_dir_all(dir.path().join("doomed/failed")).unwrap();
+    for id in pieces {
+        fs::write(dir.path().join(format!("doomed/failed/{id}.json")), r#"{"error":"yesterday","at":1}"#).unwrap();
+    }
+    let launch = ["sweep", "launch", "doomed", "--workers", "2", "--retries", "0"];
+    let mut launcher = program(dir.path(), &launch).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+    while launcher.try_wait().unwrap().is_none() {
+        let _ = Command::new("pkill").args(["-9", "-f", "run-one doomed"]).status();
+        std::thread::sleep(Duration::from_millis(30));
+    }
+    let ended = launcher.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(1), "{}", message(&ended));
+    assert!(!message(&ended).contains("yesterday"), "{}", message(&ended));
+    let shown = tce(dir.path(), &["sweep", "status", "doomed", "--json"]);
+    let status: serde_json::Value = serde_json::from_slice(&shown.stdout).unwrap();
+    assert_eq!((shown.status.code(), &status["running"]), (Some(1), &serde_json::json!([])), "{status}");
+    let failed = status["failed"].as_array().unwrap();
+    assert!(!failed.is_empty() && failed.iter().all(|f| f[1].as_str().unwrap().contains("signal")), "{status}");
+    // Launched again, they are done.
+    assert!(tce(dir.path(), &launch).status.success());
+    assert!(tce(dir.path(), &["sweep", "status", "doomed"]).status.success());
+}
+
+#[test]
+fn a_file_that_changed_since_the_plan_is_a_failure_with_a_reason() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = crate::common::data_pair(dir.path(), tce_data::Agent::Hopper, tce_data::Shift::Morph);
+    let file = describe(dir.path(), "s", 1);
+    let text = fs::read_to_string(dir.path().join(&file)).unwrap();
+    let data = format!("\n[data.\"hopper-morph:medium->expert\"]\nsource = {source:?}\ntarget = {target:?}\n");
+    fs::write(dir.path().join(&file), text.replace("from_zoo = true", "") + &data).unwrap();
+    let planned = tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]);
+    assert!(planned.status.success(), "{}", message(&planned));
+    let mut rows = fs::read(&target).unwrap();
+    *rows.last_mut().unwrap() ^= 1;
+    fs::write(&target, rows).unwrap();
+    assert_eq!(tce(dir.path(), &["sweep", "run-one", "s", "0"]).status.code(), Some(1));
+    let shown = tce(dir.path(), &["sweep", "status", "s", "--json"]);
+    let status: serde_json::Value = serde_json::from_slice(&shown.stdout).unwrap();
+    assert!(status["failed"][0][1].as_str().is_some_and(|e| e.contains("target.hdf5")), "{status}");
 }
 
 /// Scripts in place of Slurm's programs.

@@ -283,7 +283,10 @@ impl Launch {
                 output.print(&status, render::status);
                 match failed {
                     0 => Ok(()),
-                    _ => status.healthy(),
+                    n => {
+                        status.healthy()?;
+                        Err(Error::Failed(format!("{n} of the sweep's pieces of work are not done; launch it again")))
+                    }
                 }
             }
         }
