@@ -129,6 +129,19 @@ pub fn ensure_fits(learner: &LearnerConfig, rows: LearnedRows) -> Result<()> {
     Ok(())
 }
 
+/// One of the trainings of a run.
+struct Training<'a> {
+    /// What it is called in messages.
+    name: &'a str,
+    /// One member per seed.
+    data: Vec<MemberData>,
+    learner: &'a LearnerConfig,
+    /// Where its policies are evaluated, if anywhere.
+    arena: Option<Arena>,
+    /// The place of its files.
+    directory: &'a Path,
+}
+
 impl TrainingRun<'_> {
     /// Trains the policies, or takes them from the directory if this run is done.
     ///
@@ -151,8 +164,8 @@ impl TrainingRun<'_> {
         tce_base::write_atomically(&out.join("config.toml"), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
-        let (policies, learned) =
-            self.train(method.name, data, &self.config.learner, arena, (out, &key), inputs, device)?;
+        let training = Training { name: method.name, data, learner: &self.config.learner, arena, directory: out };
+        let (policies, learned) = self.train(training, &key, inputs, device)?;
         let verdict = match self.comparison {
             Comparison::Skip => None,
             Comparison::Recommend => {
@@ -195,17 +208,15 @@ impl TrainingRun<'_> {
         Ok(self.seeds.iter().map(member).collect())
     }
 
-    /// Trains a policy per seed in a directory, or takes them from it if this training is done. `key` is the hash of all its inputs.
+    /// Trains a policy per seed, or takes them from their directory if this training is done. `key` is the hash of all inputs.
     fn train(
         &self,
-        name: &str,
-        data: Vec<MemberData>,
-        learner: &LearnerConfig,
-        arena: Option<Arena>,
-        (directory, key): (&Path, &str),
+        training: Training,
+        key: &str,
         inputs: &Inputs,
         device: &Device,
     ) -> Result<(Vec<PathBuf>, Learned)> {
+        let Training { name, data, learner, arena, directory } = training;
         tce_base::begin_step(&training_step(name));
         let names = self.seeds.iter().map(|&seed| policy_file(seed));
         if let Some(done) = Done::read(directory, key)? {
@@ -228,7 +239,8 @@ impl TrainingRun<'_> {
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
         let directory = self.out.join("baseline");
-        let (files, _) = self.train(BASELINE, data, &learner, None, (&directory, key), inputs, device)?;
+        let training = Training { name: BASELINE, data, learner: &learner, arena: None, directory: &directory };
+        let (files, _) = self.train(training, key, inputs, device)?;
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 

@@ -27,9 +27,9 @@ fn walks(stored: fn(f32) -> f32) -> Transitions {
 
 #[test]
 fn next_actions_are_found_where_successors_are_rounded() {
-    let ways: [(&str, fn(f32) -> f32); 2] = [("exact", |x| x), ("three digits", |x| (x * 1e3).round() / 1e3)];
-    for (what, stored) in ways {
-        let parts = vec![Arc::new(walks(stored))];
+    let rows = [("exact", walks(|x| x)), ("three digits", walks(|x| (x * 1e3).round() / 1e3))];
+    for (what, rows) in rows {
+        let parts = vec![Arc::new(rows)];
         let (streams, standardizer) = (Streams::new(1), Standardizer::identity(2));
         let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
         let buffer = Buffer::new(vec![member], 1000).unwrap();
