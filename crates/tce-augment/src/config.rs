@@ -71,9 +71,7 @@ impl GeneratorConfig {
             rows: 100_000,
         }
     }
-}
 
-impl GeneratorConfig {
     /// How many rows are generated beside a share λ of so many source rows (Eq. 9).
     pub fn rows_beside(&self, lambda: f64, source: usize) -> usize {
         match self.rows {

@@ -72,6 +72,19 @@ pub fn support(inputs: &Inputs, config: &Config) -> Option<Support> {
     Some(support)
 }
 
+/// The learned dynamics that filter generated rows, where `config` says that any do.
+pub fn filtering_models(
+    inputs: &Inputs,
+    config: &Config,
+    root: &Path,
+    device: &Device,
+) -> Result<Option<OffPolicyEvaluator>> {
+    match config.filter.by_dynamics() {
+        true => OffPolicyEvaluator::train(inputs, &config.dynamics, root, device).map(Some),
+        false => Ok(None),
+    }
+}
+
 /// What decides TCE's generated rows.
 #[derive(Serialize)]
 struct Spec<'a> {
@@ -102,10 +115,7 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
             config.mixture.lambda
         )));
     }
-    let evaluator = match config.filter.by_dynamics() {
-        true => Some(OffPolicyEvaluator::train(inputs, &config.dynamics, root, device)?),
-        false => None,
-    };
+    let evaluator = filtering_models(inputs, config, root, device)?;
     let spec = Spec {
         networks: place.name(),
         labels: labels.name(),

@@ -22,12 +22,11 @@ use tce_data::Task;
 use tce_diagnosis::Diagnosis;
 use tce_nn::Device;
 
-use crate::augment::{finisher, label_models, networks, support};
+use crate::augment::{filtering_models, finisher, label_models, networks, support};
 use crate::config::{Config, GeneratedRows};
 use crate::course::Course;
 use crate::error::{Error, Result};
 use crate::inputs::{Domains, InputSpec, Inputs};
-use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::stage::Stage;
 
 pub mod cycles;
@@ -157,11 +156,6 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         (Some(agent), Some(shift)) if options.simulator => Some((agent, shift)),
         _ => None,
     };
-    let evaluator = config
-        .filter
-        .by_dynamics()
-        .then(|| OffPolicyEvaluator::train(inputs, &config.dynamics, root, device))
-        .transpose()?;
     let imitated = inputs.imitated(&config.target);
     let sampler = Sampler {
         generator: &generator,
@@ -169,7 +163,7 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         config,
         target: &imitated,
         support: support(inputs, config),
-        evaluator,
+        evaluator: filtering_models(inputs, config, root, device)?,
         seeds,
         member,
         simulator,
