@@ -60,7 +60,7 @@ pub struct Augmenter {
 
 impl Augmenter {
     /// Trains label models and score networks for every seed of `work`. Actions are in [-1, 1]. `rule` tells whether a state ends an
-    /// episode, where the robot's rule is known.
+    /// episode, where the robot's rule is known. Rows whose s' is unknown are left out.
     ///
     /// # Errors
     /// If a table or a setting cannot be used, a network diverges, or the user interrupts.
@@ -76,6 +76,8 @@ impl Augmenter {
                 "filter.by: found \"consistency\", expected \"zscore\": learned dynamics are the caller's (tce_learn::dynamics)".into(),
             ));
         }
+        let source = &*source.with_successors();
+        let target = &*target.with_successors();
         let any_terminal = source.terminals.iter().chain(&target.terminals).any(|terminal| *terminal);
         let terminal = settings.labels.terminal_for(rule.is_some(), any_terminal);
         let learn_terminals = terminal == Terminal::Learned;
@@ -101,8 +103,7 @@ impl Augmenter {
             return Err(Error::Failed(format!("seeds: found {found}, expected {members}: one for each member")));
         }
         let streams: Vec<_> = seeds.iter().map(|&seed| Streams::new(seed)).collect();
-        let support = self.support.as_ref();
-        let draw = Draw { support, ..Draw::new(&self.settings.generator.sampler, &streams, &self.target) };
+        let draw = Draw::new(&self.settings.generator.sampler, &streams, &self.target).within(self.support.as_ref());
         let (states, successors) = self.generator.sample_pairs(rows, y_max, &draw)?;
         Ok(Pairs { states, successors, rows })
     }

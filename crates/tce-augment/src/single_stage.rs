@@ -233,7 +233,7 @@ impl SingleStage {
     }
 
     /// `config.rows` rows for each member. A network with scores draws them under the best percentiles of `scores`, those of its training
-    /// rows. `start` are rows where a process that starts at data starts.
+    /// rows. `start` are the rows that it was trained on, where a process that starts at data starts.
     ///
     /// # Errors
     /// If no row of a member is finite, or the user interrupts.

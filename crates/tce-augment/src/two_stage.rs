@@ -35,9 +35,11 @@ pub struct Generator {
 pub struct Trained {
     /// The maps.
     pub units: Units,
-    /// Last reported loss of q_mix, per member.
+    /// Last reported loss of q_mix, per member; no number where a member diverged after it was done.
+    #[serde(deserialize_with = "tce_diffusion::or_nan")]
     pub state_loss: Vec<f32>,
-    /// Last reported loss of q_tran, per member.
+    /// The same of q_tran.
+    #[serde(deserialize_with = "tce_diffusion::or_nan")]
     pub transition_loss: Vec<f32>,
     /// Held-out losses at the ends of q_mix's cycles; empty where its length was given.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -56,7 +58,8 @@ pub struct Draw<'a> {
     pub sampler: &'a Sampler,
     /// The members' random streams.
     pub members: &'a [Streams],
-    /// The rows that the networks were trained on, where a process that starts at data starts.
+    /// The target's rows, where a process that starts at data starts (`start = "data"`, which is in no preset). So does q_mix, which has
+    /// learned source states, too. That is a choice: it starts at target states whatever ŷ is, and ŷ alone leads away from them.
     pub target: &'a Transitions,
     /// Where sampled chunks are kept, if they are.
     pub kept: Option<Chunks<'a>>,
@@ -68,6 +71,16 @@ impl<'a> Draw<'a> {
     /// Nothing is kept, nothing respected.
     pub fn new(sampler: &'a Sampler, members: &'a [Streams], target: &'a Transitions) -> Self {
         Self { sampler, members, target, kept: None, support: None }
+    }
+
+    /// The same, but drawn rows respect `support`.
+    pub fn within(self, support: Option<&'a Support>) -> Self {
+        Self { support, ..self }
+    }
+
+    /// The same, but sampled chunks are kept.
+    pub fn keeping(self, chunks: Chunks<'a>) -> Self {
+        Self { kept: Some(chunks), ..self }
     }
 
     /// Live `rows` within the support.

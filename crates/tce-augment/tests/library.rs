@@ -61,6 +61,28 @@ fn two_tables_become_a_third_one() {
     assert!(message.contains("found 2, expected 1"), "{message}");
 }
 
+/// Terminal rows without s' repeat s there. Models of the dynamics would learn that the robot stands still.
+#[test]
+fn rows_without_a_successor_are_left_out() {
+    let log = |gain: f32, rows: usize, seed: u64| {
+        let mut t = walk(gain, rows, seed);
+        for i in (9..rows).step_by(10) {
+            (t.terminals[i], t.timeouts[i], t.known[i]) = (true, false, false);
+            let s = t.observation(i).to_vec();
+            t.next_observations[3 * i..3 * i + 3].copy_from_slice(&s);
+        }
+        t
+    };
+    let (source, target, device) = (log(0.2, 300, 1), log(0.1, 200, 2), on_cpu());
+    let pairs = |source: &Transitions, target: &Transitions| {
+        let augmenter = Augmenter::fit(source, target, &short(), None, &Work::new(&[3], &device)).unwrap();
+        augmenter.sample(50, 0.5, &[3]).unwrap()
+    };
+    let known = [&source, &target].map(|t| t.with_successors().into_owned());
+    assert_eq!(known.each_ref().map(Transitions::len), [270, 180]);
+    assert_eq!(pairs(&source, &target), pairs(&known[0], &known[1]));
+}
+
 #[test]
 fn one_network_over_whole_transitions() {
     let (target, device) = (walk(0.1, 200, 2), on_cpu());

@@ -53,6 +53,8 @@ struct Course {
     began: Option<Instant>,
     bar: Option<Weak<Counter>>,
     worked: bool,
+    /// Whether an earlier command has done a part of the step: what is left of it tells nothing of its cost.
+    resumed: bool,
     /// Seconds per unit of size, by kind.
     costs: BTreeMap<String, f64>,
     memory: Option<PathBuf>,
@@ -66,12 +68,13 @@ impl Course {
         }
         let Some(next) = (from..self.steps.len()).find(|i| self.steps[*i].name == name) else { return };
         self.end(now);
-        (self.at, self.began, self.bar, self.worked) = (Some(next), Some(now), None, false);
+        (self.at, self.began, self.bar) = (Some(next), Some(now), None);
+        (self.worked, self.resumed) = (false, false);
     }
 
     /// Remembers what the step under way has cost.
     fn end(&mut self, now: Instant) {
-        if let (Some(at), Some(began), true) = (self.at, self.began, self.worked)
+        if let (Some(at), Some(began), true) = (self.at, self.began, self.worked && !self.resumed)
             && self.steps[at].size > 0.0
         {
             let step = &self.steps[at];
@@ -141,6 +144,13 @@ pub fn begin_step(name: &str) {
             *headline = Some(Headline::drawn_by(text));
         }
         None => {}
+    }
+}
+
+/// The step under way goes on from a checkpoint: its time is not remembered as the cost of a whole one.
+pub fn resume_step() {
+    if let Some(course) = course().as_mut() {
+        course.resumed = true;
     }
 }
 
@@ -260,6 +270,16 @@ mod tests {
         assert_eq!((c.line(start).as_str(), c.costs.len()), ("step 3 of 3: two", 0));
         c.begin("data", start);
         assert_eq!(c.line(start), "step 3 of 3: two", "what is behind does not come again");
+    }
+
+    #[test]
+    fn a_step_that_goes_on_from_a_checkpoint_has_no_cost() {
+        let (mut c, start) = (course(), Instant::now());
+        c.costs.insert("clone".into(), 30.0);
+        c.begin("one", start);
+        (c.worked, c.resumed) = (true, true);
+        c.begin("two", start + Duration::from_secs(1));
+        assert_eq!((c.costs["clone"], c.resumed), (30.0, false), "the cost of a whole step stays");
     }
 
     #[test]

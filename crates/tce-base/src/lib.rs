@@ -35,7 +35,7 @@ pub mod wrap;
 
 pub use auto::OrAuto;
 pub use checked::{Damage, JsonError, first_damaged, read_json, sha256_files, verify_sha256};
-pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course};
+pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course, resume_step};
 pub use files::{
     AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, link_first, move_into_place, read_if_there,
     sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,

@@ -17,6 +17,9 @@ pub fn mean_and_error(values: &[f64]) -> (f64, f64) {
 /// `61.7 ± 4.2`, or without the spread for one value.
 pub fn plus_minus(values: &[f64]) -> String {
     let (mean, std) = mean_std(values);
+    if values.is_empty() {
+        return "-".to_owned();
+    }
     if values.len() > 1 { format!("{mean:.1} ± {std:.1}") } else { format!("{mean:.1}") }
 }
 
@@ -30,6 +33,7 @@ mod tests {
         assert_eq!(mean_and_error(&[1.0, 3.0, 1.0, 3.0]), (2.0, (1.0f64 / 3.0).sqrt()));
         assert_eq!(mean_and_error(&[4.0]), (4.0, 0.0));
         assert_eq!(plus_minus(&[1.0, 2.0, 3.0]), "2.0 ± 1.0");
+        assert_eq!(plus_minus(&[]), "-");
         assert_eq!(plus_minus(&[61.7]), "61.7");
     }
 }

@@ -12,20 +12,23 @@
 //!
 //! The pace hardly depends on the start, a fall, an accident or the place where the log was cut. The return shows
 //! whether a robot falls. A group's spread is the range of its values; with ten or more values, without the outer tenth
-//! at either end.
+//! at either end. (In a split by pace, returns keep the outer tenth. Falls that are too short for a pace join the worse
+//! group by their return; if there are many, its long trajectories are this tenth, and the returns would no longer show
+//! that they are as high as the better group's.)
 //!
 //! # The rule
 //!
 //! The trajectories are split into two groups of least variance (weighted by rows): the whole ones by pace, then by
 //! return, then all by pace; the first clear split is used. Let `g` be the gap between the groups, divided by the
 //! spread plus a hundredth of the better group's mean, and c the setting ([`CLEAR_GAP`]). A split is clear if the
-//! better group's mean return is higher by 15 % and one of these holds:
+//! better group's mean return is higher by 15 %, with and without the trajectories that were assigned afterwards, and
+//! one of these holds:
 //!
 //! - by pace: g_pace ≥ c, and the mean paces differ by 15 % (and, if the better group has one whole trajectory only,
 //!   g_return ≥ .6 c);
 //! - by both: g_return ≥ .6 c and g_pace ≥ .6 c, and the mean paces differ by 5 %;
-//! - by return (robots that are rewarded for not falling): g_return ≥ 1.5 c, and the worse group has two or more whole
-//!   trajectories. A single short one is an accident, not a behaviour.
+//! - by return (robots that are rewarded for not falling): the split is one by return, g_return ≥ 1.5 c, and the worse
+//!   group has two or more whole trajectories. A single short one is an accident, not a behaviour.
 //!
 //! For returns, the spread is the larger one of both groups. For paces, it is the better group's (a bad behaviour may
 //! be irregular), or the other group's if a group has only one trajectory. Cut trajectories count in a group's values
@@ -90,8 +93,9 @@ pub fn choose_trajectories_with(data: &Transitions, clear_gap: f64) -> Choice {
     let trajectories = measure(data);
     let mut too_few = None;
     for (measure, whole_only) in [(Measure::Pace, true), (Measure::Return, true), (Measure::Pace, false)] {
-        let Some(better) = split(data, &trajectories, measure, whole_only) else { continue };
-        let Some(threshold) = clear(&trajectories, &better, measure, clear_gap) else { continue };
+        let Some(split) = split(data, &trajectories, measure, whole_only) else { continue };
+        let Some(threshold) = clear(&trajectories, &split, measure, clear_gap) else { continue };
+        let better = split.better;
         let rows: Vec<usize> = trajectories
             .iter()
             .zip(&better)
@@ -163,9 +167,17 @@ fn pace(rewards: &[f32], window: usize) -> f64 {
     if n == 0 { mean(rewards) } else { (means[(n - 1) / 2] + means[n / 2]) / 2.0 }
 }
 
-/// The split of least variance by `measure` (of whole trajectories only, or of all that have it): for each trajectory,
-/// whether it is in the better group. `None` if all values are equal or fewer than two trajectories have one.
-fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whole_only: bool) -> Option<Vec<bool>> {
+/// The trajectories in two groups.
+struct Split {
+    /// Of each trajectory that took part in the split, whether it is in the better group; `None` for the others.
+    known: Vec<Option<bool>>,
+    /// The same for every trajectory, after the others were assigned.
+    better: Vec<bool>,
+}
+
+/// The split of least variance by `measure` (of whole trajectories only, or of all that have it). `None` if all values
+/// are equal or fewer than two trajectories have one.
+fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whole_only: bool) -> Option<Split> {
     let value = |t: &Trajectory| t.value(measure).filter(|_| !whole_only || t.whole.is_some());
     let mut known: Vec<(f64, f64)> = trajectories.iter().filter_map(|t| Some((value(t)?, t.len() as f64))).collect();
     known.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -200,7 +212,7 @@ fn split(data: &Transitions, trajectories: &[Trajectory], measure: Measure, whol
         }
     }
     // A trajectory without any measure is kept: it shows no fall.
-    Some(better.into_iter().map(|b| b.unwrap_or(true)).collect())
+    Some(Split { known, better: better.into_iter().map(|b| b.unwrap_or(true)).collect() })
 }
 
 /// The group (`true`: the better one) whose members had earned about as much at the age at which `cut` was cut.
@@ -243,8 +255,15 @@ struct Group {
 }
 
 impl Group {
-    fn of(trajectories: &[Trajectory], better: &[bool], group: bool, measure: Measure) -> Option<Group> {
-        let of_group = || trajectories.iter().zip(better).filter(|(_, b)| **b == group).map(|(t, _)| t);
+    /// The group of the trajectories whose index is a `member`; with ten or more values, `trimmed` leaves out the outer
+    /// tenth at either end of the range.
+    fn of(
+        trajectories: &[Trajectory],
+        member: impl Fn(usize) -> bool,
+        measure: Measure,
+        trimmed: bool,
+    ) -> Option<Group> {
+        let of_group = || trajectories.iter().enumerate().filter(|(k, _)| member(*k)).map(|(_, t)| t);
         // Cut trajectories count only if the group has no whole ones.
         let whole = of_group().filter(|t| t.whole.is_some()).filter_map(|t| t.value(measure));
         let mut values: Vec<f64> = whole.collect();
@@ -252,7 +271,7 @@ impl Group {
             values = of_group().filter_map(|t| t.value(measure)).collect();
         }
         values.sort_by(f64::total_cmp);
-        let (count, outer) = (values.len(), values.len() / 10);
+        let (count, outer) = (values.len(), if trimmed { values.len() / 10 } else { 0 });
         Some(Group { count, mean: mean(&values)?, low: values[outer], high: values[count - 1 - outer] })
     }
 
@@ -277,13 +296,18 @@ fn differ(worse: &Group, better: &Group, share: f64) -> bool {
 }
 
 /// The threshold, if the split by `measure` is clear.
-fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_gap: f64) -> Option<f64> {
-    let groups = |m| {
-        let of = |group| Group::of(trajectories, better, group, m);
-        Some((of(false)?, of(true)?))
+fn clear(trajectories: &[Trajectory], split: &Split, measure: Measure, clear_gap: f64) -> Option<f64> {
+    // Beside many short falls, the long trajectories of the worse group are its outer tenth.
+    let trimmed = |m: Measure| measure == Measure::Return || m == Measure::Pace;
+    let groups = |m: Measure| {
+        let of = |group: bool| Group::of(trajectories, |k| split.better[k] == group, m, trimmed(m));
+        of(false).zip(of(true))
     };
     let (returns, paces) = (groups(Measure::Return), groups(Measure::Pace));
-    if returns.as_ref().is_some_and(|(w, b)| !differ(w, b, LEAST_DIFFERENCE)) {
+    // The falls that joined the worse group must not make the difference alone.
+    let of = |group: bool| Group::of(trajectories, |k| split.known[k] == Some(group), Measure::Return, false);
+    let took_part = of(false).zip(of(true));
+    if [&returns, &took_part].into_iter().flatten().any(|(w, b)| !differ(w, b, LEAST_DIFFERENCE)) {
         return None;
     }
     let size = |groups: &Option<(Group, Group)>, m| groups.as_ref().map_or(f64::NEG_INFINITY, |(w, b)| gap(w, b, m));
@@ -295,7 +319,8 @@ fn clear(trajectories: &[Trajectory], better: &[bool], measure: Measure, clear_g
     let pace = by_pace >= clear_gap && paces_differ && !lone;
     let both = paces_differ_a_little && by_return.min(by_pace) >= BOTH * clear_gap;
     let several = returns.as_ref().is_some_and(|(w, _)| w.count > 1);
-    let alone = several && by_return >= ALONE * clear_gap;
+    // Returns decide alone only where they made the groups: a split by pace may divide equal trajectories at random.
+    let alone = measure == Measure::Return && several && by_return >= ALONE * clear_gap;
     let (worse, better) = match measure {
         Measure::Return => returns?,
         Measure::Pace => paces?,

@@ -10,13 +10,14 @@
 //!
 //! One reason against the rows is enough. Without one, only the score of the policy speaks for them: all others are about single rows,
 //! and possible rows may still teach a behaviour that nobody had ([`crate::implied`]). "For certain" means by [`SURE`] standard errors of the
-//! mean over episodes. Where there is no such score, the data do not tell.
+//! mean over episodes; one episode has no such error, so that nothing is for certain. Where there is no such score, the data do not tell.
 //!
 //! That rows are good does not mean that a policy learns more from them than from the target rows alone. Only scores tell that.
 
 use std::fmt;
 
 use crate::diagnosis::Diagnosis;
+use crate::implied::Implied;
 use crate::memorisation;
 pub use crate::numbers::percent;
 
@@ -73,15 +74,15 @@ enum Taught {
     Unknown(String),
 }
 
-fn taught(d: &Diagnosis) -> Taught {
-    let rollout = d.implied.as_ref().and_then(|i| i.rollout.as_ref());
+fn taught(implied: Option<&Implied>) -> Taught {
+    let rollout = implied.and_then(|i| i.rollout.as_ref());
     let Some(rollout) = rollout else {
         return Taught::Unknown("the policy that they teach could not be tried without a simulator".into());
     };
     if let Some(why) = &rollout.failed {
         return Taught::Bad(format!("the policy that they teach cannot act to the end of an episode ({why})"));
     }
-    let behaviour = d.implied.as_ref().and_then(|i| i.behaviour_score);
+    let behaviour = implied.and_then(|i| i.behaviour_score);
     let (Some((mean, std)), Some(behaviour)) = (rollout.score, behaviour) else {
         return Taught::Unknown(
             "there are no reference returns by which to compare the policy that they teach with the target data".into(),
@@ -94,9 +95,11 @@ fn taught(d: &Diagnosis) -> Taught {
     );
     let (lost, error) = (behaviour - mean, SURE * std / (episodes as f64).sqrt());
     let allowed = LOSS * behaviour.abs();
-    if lost - error > allowed {
+    // The standard deviation of one episode is 0, which says nothing of other episodes.
+    let several = episodes > 1;
+    if several && lost - error > allowed {
         Taught::Bad(clause)
-    } else if episodes > 1 && lost + error <= allowed {
+    } else if several && lost + error <= allowed {
         Taught::Good(clause)
     } else {
         Taught::Unknown(format!("{clause}, and this scatter leaves open whether it is worse"))
@@ -108,7 +111,7 @@ impl Diagnosis {
     pub fn advice(&self) -> Advice {
         let own = self.at_own_bound();
         let (mut against, mut good) = (Vec::new(), Vec::new());
-        let taught = taught(self);
+        let taught = taught(self.implied.as_ref());
         match &taught {
             Taught::Bad(clause) => against.push(clause.clone()),
             Taught::Good(clause) => good.push(clause.clone()),
@@ -148,5 +151,30 @@ impl Diagnosis {
             (true, Taught::Unknown(why)) => Advice { answer: Answer::NotTold, because: vec![why], besides: good },
             (true, _) => Advice { answer: Answer::Use, because: good, besides: vec![] },
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::implied::{ImpliedActions, ImpliedRollout};
+
+    /// Beside a target of 90, so that 81 is enough.
+    #[test]
+    fn one_episode_is_certain_of_nothing() {
+        let told = |mean: f64, std: f64, episodes: usize| {
+            let rollout =
+                ImpliedRollout { episodes, score: Some((mean, std)), returns: None, length: None, failed: None };
+            let actions = ImpliedActions { trained: None, held_out: None };
+            let implied = Implied { actions, rollout: Some(rollout), behaviour_score: Some(90.0) };
+            match taught(Some(&implied)) {
+                Taught::Good(_) => "good",
+                Taught::Bad(_) => "bad",
+                Taught::Unknown(_) => "unknown",
+            }
+        };
+        assert_eq!([told(5.0, 0.0, 1), told(90.0, 0.0, 1)], ["unknown"; 2]);
+        assert_eq!([told(5.0, 0.0, 2), told(90.0, 0.0, 2)], ["bad", "good"]);
+        assert_eq!([told(78.0, 3.0, 10), told(80.0, 3.0, 10)], ["bad", "unknown"]);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use tce_nn::{NamedParameters, NetworkError};
 
 use crate::DiffusionError;
@@ -68,8 +68,22 @@ impl UntilDone {
 pub struct CycleEnd {
     /// Steps since the beginning.
     pub step: u64,
-    /// The criterion of every member.
+    /// The criterion of every member; no number where the member has diverged.
+    #[serde(deserialize_with = "or_nan")]
     pub criterion: Vec<f64>,
+}
+
+/// Reads numbers that JSON has as `null` where they were not finite: those of a member that diverged after it was done.
+///
+/// # Errors
+/// If they are no list of numbers.
+pub fn or_nan<'de, T, D>(from: D) -> Result<Vec<T>, D::Error>
+where
+    T: Deserialize<'de> + From<f32>,
+    D: Deserializer<'de>,
+{
+    let numbers: Vec<Option<T>> = Deserialize::deserialize(from)?;
+    Ok(numbers.into_iter().map(|number| number.unwrap_or_else(|| T::from(f32::NAN))).collect())
 }
 
 /// What a training until done has found so far.
@@ -136,5 +150,19 @@ impl Found {
             }
         }
         self.ends.push(end);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ends_of_cycles_survive_json_whatever_was_measured() {
+        let end = CycleEnd { step: 7, criterion: vec![0.5, f64::NAN] };
+        let back: CycleEnd = serde_json::from_str(&serde_json::to_string(&end).unwrap()).unwrap();
+        assert_eq!((back.step, back.criterion[0]), (7, 0.5));
+        assert!(back.criterion.len() == 2 && back.criterion[1].is_nan());
+        assert!(serde_json::from_str::<CycleEnd>(r#"{"step":7,"criterion":["x"]}"#).is_err());
     }
 }

@@ -20,13 +20,13 @@ pub enum DiffusionError {
     Network(#[from] NetworkError),
     /// The loss is no number any more.
     #[error(
-        "{label}: the loss of member {member} became {loss} before step {step}; lower learning_rate (now {learning_rate}) \
-         or look for huge values in the training rows"
+        "{label}: the loss of member {member} (the seeds in their order, from 0) became {loss} before step {step}; \
+         lower learning_rate (now {learning_rate}) or look for huge values in the training rows"
     )]
     Diverged {
         /// Which training.
         label: String,
-        /// Index in the population.
+        /// Index in the population, which is that of the seed.
         member: usize,
         /// The loss.
         loss: f32,

@@ -29,7 +29,7 @@ mod target;
 mod train;
 mod until_done;
 
-pub use cycles::{CycleEnd, UntilDone};
+pub use cycles::{CycleEnd, UntilDone, or_nan};
 pub use data::{Balance, Condition, Part, ScoreData, present};
 pub use error::DiffusionError;
 pub use model::{Chunks, Request, ScoreModel, uniform_labels};

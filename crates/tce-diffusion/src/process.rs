@@ -58,7 +58,7 @@ pub enum Start {
     /// N(0, I), as written.
     #[default]
     Normal,
-    /// A row of the training data + σ(1) z: the process's own marginal.
+    /// A row of the training data + σ(1) z: the process's own marginal. TCE's state network starts at target rows alone, under every label.
     Data,
 }
 

@@ -179,15 +179,17 @@ impl Trainer {
             Schedule::Constant => highest,
             Schedule::Cosine => cosine_decay(highest, step, steps),
         };
-        self.advance(data, steps, rate, checkpoints, on_loss)
+        self.advance(data, steps, rate, &[], checkpoints, on_loss)
     }
 
-    /// Takes steps until there are `steps`, step t with the learning rate `rate(t)`.
+    /// Takes steps until there are `steps`, step t with the learning rate `rate(t)`. `done` tells of which members the network is already
+    /// kept elsewhere, so that it no longer matters whether they diverge; those that it leaves out are not done.
     pub(crate) fn advance(
         &mut self,
         data: &[ScoreData],
         steps: u64,
         rate: impl Fn(u64) -> f64 + Sync,
+        done: &[bool],
         checkpoints: &mut Checkpoints,
         mut on_loss: impl FnMut(u64, &[f32]),
     ) -> Result<(), DiffusionError> {
@@ -219,13 +221,15 @@ impl Trainer {
                 let sum = sum.take().expect("at least one step");
                 let losses: Vec<_> = on_threads_of(&device, || host(sum)).iter().map(|l| l / count as f32).collect();
                 count = 0;
-                if let Some(member) = losses.iter().position(|l| !l.is_finite()) {
+                let diverged = |m: &usize| !losses[*m].is_finite() && done.get(*m) != Some(&true);
+                if let Some(member) = (0..losses.len()).find(diverged) {
                     let (label, loss) = (format!("training of {}", self.name), losses[member]);
                     let (step, learning_rate) = (self.step, self.config.learning_rate);
                     self.stop.store(true, Ordering::Relaxed);
                     return Err(DiffusionError::Diverged { label, member, loss, step, learning_rate });
                 }
-                progress.message(format!("loss {:.4}", losses.iter().sum::<f32>() / losses.len() as f32));
+                let shown: Vec<f32> = losses.iter().copied().filter(|l| l.is_finite()).collect();
+                progress.message(format!("loss {:.4}", shown.iter().sum::<f32>() / shown.len() as f32));
                 on_loss(self.step, &losses);
             }
         }

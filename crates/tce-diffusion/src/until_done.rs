@@ -26,8 +26,10 @@ use crate::{DiffusionError, ScoreData, ScoreModel, Trainer};
 
 impl Trainer {
     /// Trains until every member is done, and returns the best networks and what was measured at the ends of the cycles. A member's
-    /// result does not depend on the others. `criterion` gets a model at the end of a cycle and returns one criterion per member, the
-    /// less the better; `on_loss` as in [`Trainer::train`], whose rules for checkpoints hold here too.
+    /// result does not depend on the others, but for one thing: a member that diverges before it is done ends the training of all. One
+    /// that is done goes on beside the others, and may diverge, because its best network is kept. `criterion` gets a model at the end of
+    /// a cycle and returns one criterion per member, the less the better; `on_loss` as in [`Trainer::train`], whose rules for checkpoints
+    /// hold here too.
     ///
     /// # Errors
     /// As [`Trainer::train`], and those of `criterion`.
@@ -49,13 +51,14 @@ impl Trainer {
             if k < self.found.ends.len() {
                 continue;
             }
-            if k > 0 && self.found.done(plan).iter().all(|&done| done) {
+            let done = self.found.done(plan);
+            if k > 0 && done.iter().all(|&done| done) {
                 break;
             }
             let length = plan.first << k;
             let begin = end - length;
             let rate = |step: u64| cosine_decay(highest, step.saturating_sub(begin), length);
-            self.advance(data, end, rate, checkpoints, &mut on_loss)?;
+            self.advance(data, end, rate, &done, checkpoints, &mut on_loss)?;
             let criterion = criterion(self)?;
             let end = CycleEnd { step: end, criterion };
             let now = self.model().parameters();
@@ -136,7 +139,7 @@ mod tests {
             .train_until_done(&data, &UntilDone { limit: 100, ..PLAN }, &mut Checkpoints::none(), |_, _| {}, once)
             .unwrap();
         let rate = |step: u64| cosine_decay(1e-3, step - 100, 200);
-        first.advance(&data, 200, rate, &mut Checkpoints::none(), |_, _| {}).unwrap();
+        first.advance(&data, 200, rate, &[], &mut Checkpoints::none(), |_, _| {}).unwrap();
         let mut rest = trainer(&members);
         rest.restore(&first.state(), Path::new("x")).unwrap();
         let mut at = 0;
@@ -148,6 +151,45 @@ mod tests {
             rest.train_until_done(&data, &PLAN, &mut Checkpoints::none(), |_, _| {}, criterion).unwrap();
         assert_eq!(ends_again, ends);
         assert_eq!(again.parameters(), got);
+    }
+
+    /// Member 0 is done after two cycles. Then the network of one of the two is spoiled.
+    #[test]
+    fn a_member_that_is_done_ends_no_training_and_one_that_is_not_does() {
+        let mut x = vec![0.0; 200];
+        fill_normal(&mut Streams::new(1).stream("x"), &mut x);
+        let y = vec![0.0; 100];
+        let data = [ScoreData::conditioned(&x, 2, &y, 1).unwrap()];
+        let script = [[1.0, 1.0], [2.0, 0.5], [0.1, 0.2]];
+        let run = |trainer: &mut Trainer, limit: u64| {
+            let criterion = |t: &Trainer| {
+                let cycle = PLAN.ends().iter().position(|end| *end == t.steps()).unwrap();
+                Ok::<_, DiffusionError>(script[cycle].to_vec())
+            };
+            let plan = UntilDone { limit, ..PLAN };
+            trainer.train_until_done(&data, &plan, &mut Checkpoints::none(), |_, _| {}, criterion)
+        };
+        let members = [Streams::new(5), Streams::new(6)];
+        let mut first = trainer(&members);
+        run(&mut first, 300).unwrap();
+        let whole = |spoiled: Option<usize>| {
+            let mut state = first.state();
+            for (name, (shape, values)) in &mut state.tensors {
+                if let Some(m) = spoiled.filter(|_| name.starts_with("network.")) {
+                    let size = values.len() / shape[0];
+                    values[m * size..][..size].fill(f32::NAN);
+                }
+            }
+            let mut rest = trainer(&members);
+            rest.restore(&state, Path::new("x")).unwrap();
+            run(&mut rest, PLAN.limit)
+        };
+        let parameters = |spoiled| whole(spoiled).unwrap().0.parameters();
+        let (expected, got) = (parameters(None), parameters(Some(0)));
+        assert_eq!(got.member(0), expected.member(0), "the network of the first cycle is kept");
+        assert_eq!(got.member(1), expected.member(1));
+        let error = whole(Some(1)).err().unwrap().to_string();
+        assert!(error.contains("the loss of member 1 (the seeds in their order, from 0) became NaN"), "{error}");
     }
 
     #[test]

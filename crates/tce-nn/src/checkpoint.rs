@@ -76,7 +76,7 @@ impl Checkpoints {
 
     /// The state to resume from, with its file; once.
     pub fn restore(&mut self) -> Option<(u64, NamedParameters, PathBuf)> {
-        self.restored.take()
+        self.restored.take().inspect(|_| tce_base::resume_step())
     }
 
     /// Whether it is time for a checkpoint.

@@ -57,6 +57,13 @@ pub struct Member {
     pub verdict: Verdict,
     /// Undiscounted returns of the episodes that evaluated it.
     pub returns: Vec<f64>,
+    /// How many of these episodes ended because the physics became unstable.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub unstable: u64,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// What an evaluation came to.
@@ -219,7 +226,8 @@ fn member(done: &Document<'_>, m: usize) -> Result<Member> {
         (None, Some(why)) => Verdict::Diverged(why.to_owned()),
         (None, None) => Verdict::Unscored,
     };
-    Ok(Member { seed, verdict, returns })
+    let unstable = done.root.pointer(&at("unstable")).and_then(Value::as_u64).unwrap_or(0);
+    Ok(Member { seed, verdict, returns, unstable })
 }
 
 /// The start of a configuration's SHA-256.

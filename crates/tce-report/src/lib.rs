@@ -24,6 +24,7 @@ pub mod folder;
 pub mod html;
 pub mod merge;
 pub mod paper;
+pub mod permutation;
 pub mod record;
 pub mod sensitivity;
 pub mod stats;
@@ -35,7 +36,7 @@ pub use analysis::{Analysis, Options, analyse};
 pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use merge::{merge, mixed};
+pub use merge::{Kin, merge, mixed};
 pub use study::{Budget, Change, Cost, Method, Missing, Recipe, Recommended, Run, Study};
 
 use std::path::{Path, PathBuf};

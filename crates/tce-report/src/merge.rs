@@ -5,12 +5,12 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use tce_data::Task;
 
-use crate::folder::{RunFolder, Verdict};
+use crate::folder::Verdict;
 use crate::study::{Method, Missing, Run, Study};
 
 /// All of `studies` as one, in their order. A run that several of them have counts once. Where they differ about a run of the same
-/// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings or data for a method
-/// and task, each of them has a column of its own.
+/// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings for a method and task,
+/// all settings of the method have a column each; where they have different data, all studies.
 ///
 /// # Panics
 /// If there is none.
@@ -32,11 +32,12 @@ pub fn merge(studies: Vec<Study>) -> Study {
         merging.places.entry(Work::of(run)).or_insert(place);
     }
     studies.for_each(|study| merging.join(study));
-    merging.split();
+    // What one of them lacks another one may have; so far a method has one name.
+    let done: BTreeSet<_> = merging.out.runs.iter().map(|r| (r.task, r.method.as_str(), Some(r.member.seed))).collect();
+    merging.out.missing.retain(|m| !done.contains(&(m.task, m.method.as_str(), m.seed)));
+    merging.split("settings", |run, _| run.settings());
+    merging.split("data", |_, study| study.to_string());
     let mut out = merging.out;
-    // What one of them lacks another one may have.
-    let done: BTreeSet<_> = out.runs.iter().map(|r| (r.task, r.method.as_str(), Some(r.member.seed))).collect();
-    out.missing.retain(|m| !done.contains(&(m.task, m.method.as_str(), m.seed)));
     out.methods.sort_by_key(|m| !m.baseline);
     out
 }
@@ -60,7 +61,7 @@ struct Work {
     task: Task,
     method: String,
     seed: u64,
-    config_hash: String,
+    settings: String,
     inputs: BTreeMap<String, String>,
 }
 
@@ -70,7 +71,7 @@ impl Work {
             task: run.task,
             method: run.method.clone(),
             seed: run.member.seed,
-            config_hash: run.folder.config_hash.clone(),
+            settings: run.settings(),
             inputs: run.folder.inputs.clone(),
         }
     }
@@ -169,41 +170,69 @@ impl Merging {
         }
     }
 
-    /// Gives every study a column of its own where their runs of one method and task are different work.
-    fn split(&mut self) {
-        let runs = self.out.runs.iter();
-        for id in mixed(runs.map(|r| (r.task, r.method.as_str(), &*r.folder, r.member.seed))) {
+    /// Where runs of one method and task are different work, all runs of the method with the same `mark` are a column of their own. A mark is
+    /// made from a run and the number of its study. The columns are called after the studies that they are from.
+    fn split(&mut self, by: &str, mark: impl Fn(&Run, usize) -> String) {
+        for id in mixed(self.out.runs.iter().map(|r| (r.task, r.method.as_str(), Kin::of(r)))) {
             let at = self.out.methods.iter().position(|m| m.id == id).expect("every run has a method");
             let method = self.out.methods.remove(at);
-            let mut columns = 0;
-            for (number, name) in self.names.iter().enumerate() {
-                let own = of_study(&method, name);
-                let runs = self
-                    .out
-                    .runs
-                    .iter_mut()
-                    .zip(&self.origins)
-                    .filter(|(r, origin)| r.method == id && **origin == number);
-                let count = runs.map(|(run, _)| run.method.clone_from(&own.id)).count();
-                if count > 0 {
-                    self.out.methods.insert(at + columns, own);
-                    columns += 1;
+            // The runs of every mark, in the order of the studies.
+            let mut columns: Vec<(String, Vec<usize>)> = Vec::new();
+            for place in (0..self.out.runs.len()).filter(|k| self.out.runs[*k].method == id) {
+                let of = mark(&self.out.runs[place], self.origins[place]);
+                match columns.iter_mut().find(|(known, _)| *known == of) {
+                    Some((_, runs)) => runs.push(place),
+                    None => columns.push((of, vec![place])),
                 }
             }
-            let note =
-                format!("{id}: several studies have it with different settings or data; each is a column of its own.");
+            for (number, (_, runs)) in columns.iter().enumerate() {
+                let mut studies: Vec<&str> = Vec::new();
+                for &place in runs {
+                    let name = self.names[self.origins[place]].as_str();
+                    if !studies.contains(&name) {
+                        studies.push(name);
+                    }
+                }
+                let more = if studies.len() > 2 { ", …" } else { "" };
+                let mut name = format!("{}{more}", studies[..studies.len().min(2)].join(", "));
+                while self.out.methods.iter().any(|m| m.id == of_study(&method, &name).id) {
+                    name += "'";
+                }
+                let own = of_study(&method, &name);
+                runs.iter().for_each(|&place| self.out.runs[place].method.clone_from(&own.id));
+                self.out.methods.insert(at + number, own);
+            }
+            let note = format!("{id}: the studies have it with different {by}; each of these is a column of its own.");
             add_new(&mut self.out.notes, [note]);
         }
     }
 }
 
+/// What runs have in common that are seeds of one work, and the seed.
+pub struct Kin<'a> {
+    /// Their settings.
+    pub settings: String,
+    /// Their data.
+    pub inputs: &'a BTreeMap<String, String>,
+    /// The seed.
+    pub seed: u64,
+}
+
+impl<'a> Kin<'a> {
+    /// Of a run.
+    pub fn of(run: &'a Run) -> Self {
+        Self { settings: run.settings(), inputs: &run.folder.inputs, seed: run.member.seed }
+    }
+}
+
 /// The names of which some task has runs that are no seeds of one work: they have other settings or other data, or a seed is there twice.
-pub fn mixed<'a>(runs: impl IntoIterator<Item = (Task, &'a str, &'a RunFolder, u64)>) -> BTreeSet<String> {
-    let mut seen: BTreeMap<(Task, &str), (&RunFolder, BTreeSet<u64>)> = BTreeMap::new();
+pub fn mixed<'a>(runs: impl IntoIterator<Item = (Task, &'a str, Kin<'a>)>) -> BTreeSet<String> {
+    let mut seen: BTreeMap<(Task, &str), (Kin, BTreeSet<u64>)> = BTreeMap::new();
     let mut mixed = BTreeSet::new();
-    for (task, name, folder, seed) in runs {
-        let (first, seeds) = seen.entry((task, name)).or_insert_with(|| (folder, BTreeSet::new()));
-        let same = (&first.config_hash, &first.inputs) == (&folder.config_hash, &folder.inputs);
+    for (task, name, own) in runs {
+        let (settings, inputs, seed) = (own.settings.clone(), own.inputs, own.seed);
+        let (first, seeds) = seen.entry((task, name)).or_insert_with(|| (own, BTreeSet::new()));
+        let same = (&first.settings, first.inputs) == (&settings, inputs);
         if !seeds.insert(seed) || !same {
             mixed.insert(name.to_owned());
         }

@@ -3,7 +3,8 @@
 //! Two things go beyond `rliable`, which knows only full matrices:
 //!
 //! - **Tasks may have different numbers of runs.** Every task has the same weight, and a run the share of its task's weight. With
-//!   equal numbers all figures are those of `rliable`, the trimming of the interquartile mean included.
+//!   equal numbers all figures are those of `rliable`; so is the interquartile mean where the number of runs is a multiple of four
+//!   ([`Scores::iqm`]).
 //! - **A resample of tasks is shared.** Where two methods are compared and tasks are drawn, both get the same tasks.
 
 use rand::RngExt;
@@ -14,7 +15,7 @@ use tce_base::{Rng, Streams};
 /// The scores of one method: for every task, the scores of its runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scores {
-    tasks: Vec<Vec<f64>>,
+    pub(crate) tasks: Vec<Vec<f64>>,
 }
 
 /// Scores that nothing can be said about.
@@ -114,8 +115,9 @@ impl Scores {
         self.average(|s| f64::from(u8::from(s > threshold)))
     }
 
-    /// Interquartile mean: the mean of the middle half of all runs. Of N runs `floor(N / 4)` runs' worth of weight goes on
-    /// either side, which is `rliable`'s (and scipy's) rule where all tasks have equally many runs.
+    /// Interquartile mean: the mean of the middle half of all runs' weight. A run on the border of the half counts with the part of its
+    /// weight that is inside, so that methods with different numbers of runs are cut alike. `rliable` and scipy leave out whole runs,
+    /// `floor(N / 4)` on either side: the same where N is a multiple of four and all tasks have equally many runs.
     pub fn iqm(&self) -> f64 {
         let tasks = self.tasks.len() as f64;
         let mut runs: Vec<(f64, f64)> = Vec::with_capacity(self.runs());
@@ -124,13 +126,11 @@ impl Scores {
             runs.extend(task.iter().map(|&s| (s, weight)));
         }
         runs.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let n = runs.len();
-        let cut = (n / 4) as f64 / n as f64;
-        // What is left of a weight that covers [from, from + weight] of [0, 1] within [cut, 1 - cut].
+        // What is left of a weight that covers [from, from + weight] of [0, 1] within the middle half.
         let (mut from, mut sum, mut left) = (0.0, 0.0, 0.0);
         for (score, weight) in runs {
             let to = from + weight;
-            let inside = (to.min(1.0 - cut) - from.max(cut)).max(0.0);
+            let inside = (to.min(0.75) - from.max(0.25)).max(0.0);
             // The sum of weights is 1 up to rounding: a sliver at a border is none of the middle half.
             if inside > 1e-9 * weight {
                 sum += inside * score;
@@ -240,39 +240,6 @@ impl Bootstrap {
     }
 }
 
-/// How often a random assignment of a task's runs to the two methods gives a probability of improvement as far from one half as
-/// the true one: a stratified permutation test, two-sided, exact up to the number of shuffles. With few runs it cannot become small,
-/// whereas a bootstrap's interval can shrink to a point.
-///
-/// # Errors
-/// If the two are not on equally many tasks.
-pub fn permutation_p(streams: Streams, name: &str, shuffles: usize, x: &Scores, y: &Scores) -> Result<f64, StatsError> {
-    if x.tasks.len() != y.tasks.len() {
-        return Err(StatsError::OtherTasks { found: y.tasks.len(), expected: x.tasks.len() });
-    }
-    let distance = |x: &Scores, y: &Scores| (probability_of_improvement(x, y) - 0.5).abs();
-    let observed = distance(x, y);
-    let one = |k: usize| {
-        let mut rng = streams.indexed(&format!("report/permutation/{name}"), k as u64);
-        let (mut a, mut b) = (x.clone(), y.clone());
-        for (a, b) in a.tasks.iter_mut().zip(&mut b.tasks) {
-            let mut all: Vec<f64> = a.iter().chain(b.iter()).copied().collect();
-            // The first places of a Fisher-Yates shuffle are a's.
-            for place in 0..a.len() {
-                let from = rng.random_range(place..all.len());
-                all.swap(place, from);
-            }
-            let (first, rest) = all.split_at(a.len());
-            a.copy_from_slice(first);
-            b.copy_from_slice(rest);
-        }
-        usize::from(distance(&a, &b) >= observed - 1e-12)
-    };
-    let as_far: usize = (0..shuffles).into_par_iter().map(one).sum();
-    // The true assignment is one of them.
-    Ok((as_far + 1) as f64 / (shuffles + 1) as f64)
-}
-
 fn mean_of(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let n = values.len() as f64;
     values.sum::<f64>() / n
@@ -377,29 +344,22 @@ mod tests {
         close(&y, &[(1.0, 1.0), (0.75, 1.0), (0.25, 0.5), (0.0, 0.25)], 0.084);
     }
 
-    /// scipy.stats.trim_mean(range, 0.25) for lengths that are no multiples of four.
+    /// The middle half of the weight: nine runs of 1, 3, ..., 17 keep 7, 9, 11 and three quarters of 5 and 13. Of a multiple of four it is
+    /// scipy.stats.trim_mean(range, 0.25).
     #[test]
-    fn the_trimming_is_scipys() {
-        for (n, expected) in [(1, 0.0), (3, 1.0), (4, 1.5), (5, 2.0), (7, 3.0)] {
-            let scores = Scores::new(vec![(0..n).map(f64::from).collect()]).unwrap();
-            assert!((scores.iqm() - expected).abs() < 1e-12, "{n}: {}", scores.iqm());
+    fn the_interquartile_mean_is_of_exactly_the_middle_half() {
+        let of = |scores: Vec<f64>| Scores::new(vec![scores]).unwrap().iqm();
+        assert!((of((0..9).map(|k| f64::from(2 * k + 1)).collect()) - 9.0).abs() < 1e-12);
+        for (n, expected) in [(1, 0.0), (2, 0.5), (3, 1.0), (4, 1.5), (8, 3.5)] {
+            assert!((of((0..n).map(f64::from).collect()) - expected).abs() < 1e-12, "{n}");
         }
-        // [0, 0, 9, 30, 100, 1000]: one run of six goes on either side.
+        // Three runs: half of the weight is the middle one and a quarter of each of the others.
+        assert!((of(vec![0.0, 30.0, 90.0]) - (0.25 * 0.0 + 30.0 + 0.25 * 90.0) / 1.5).abs() < 1e-9);
+        // As many runs twice change nothing, however many there are.
+        assert!((of(vec![0.0, 30.0, 90.0]) - of(vec![0.0, 0.0, 30.0, 30.0, 90.0, 90.0])).abs() < 1e-9);
+        // [0, 0, 9, 30, 100, 1000]: half of the second and of the fifth run are outside.
         let scores = Scores::new(vec![vec![30.0, 0.0, 9.0], vec![1000.0, 0.0, 100.0]]).unwrap();
-        assert!((scores.iqm() - (0.0 + 9.0 + 30.0 + 100.0) / 4.0).abs() < 1e-12);
-    }
-
-    /// Two runs against two, all above: 2 of the 6 assignments are as far. Five against five: 2 of 252.
-    #[test]
-    fn permutations_are_counted() {
-        let p = |n: u32| {
-            let of = |from: u32| Scores::new(vec![(from..from + n).map(f64::from).collect()]).unwrap();
-            permutation_p(Streams::new(0), "test", 20_000, &of(100), &of(0)).unwrap()
-        };
-        assert!((p(2) - 2.0 / 6.0).abs() < 0.015, "{}", p(2));
-        assert!((p(5) - 2.0 / 252.0).abs() < 0.003, "{}", p(5));
-        let same = by_task(&X);
-        assert_eq!(permutation_p(Streams::new(0), "test", 100, &same, &same).unwrap(), 1.0);
+        assert!((scores.iqm() - (0.5 * 0.0 + 9.0 + 30.0 + 0.5 * 100.0) / 3.0).abs() < 1e-9);
     }
 
     #[test]

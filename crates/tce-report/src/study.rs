@@ -75,6 +75,21 @@ pub struct Recipe {
 }
 
 impl Recipe {
+    /// [`Run::settings`] of a run in `folder`.
+    pub fn settings(&self, folder: &RunFolder) -> String {
+        if self.preset.is_some() { self.told() } else { folder.config_hash.clone() }
+    }
+
+    /// Its preset and what differs from it, in a line.
+    pub fn told(&self) -> String {
+        let changes = self.changed.iter().map(|c| format!("{} = {}", c.key, c.value)).collect::<Vec<_>>().join(", ");
+        match (&self.preset, changes.as_str()) {
+            (None, _) => "settings like none of the presets".into(),
+            (Some(preset), "") => format!("preset {preset}"),
+            (Some(preset), changes) => format!("preset {preset}, {changes}"),
+        }
+    }
+
     /// Whether the settings are the paper's.
     pub fn is_papers(&self) -> bool {
         self.preset.as_deref() == Some("paper") && self.changed.is_empty()
@@ -140,6 +155,14 @@ pub struct Run {
     pub folder: Arc<RunFolder>,
     /// Where its settings come from.
     pub recipe: Arc<Recipe>,
+}
+
+impl Run {
+    /// What tells its settings from those of other runs of its task and method: its recipe, or all of its configuration where that is like
+    /// none of the presets. Settings that it does not use make no difference.
+    pub fn settings(&self) -> String {
+        self.recipe.settings(&self.folder)
+    }
 }
 
 /// A planned or begun run without a result.

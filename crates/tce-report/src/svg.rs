@@ -99,9 +99,14 @@ fn n(value: f64) -> String {
     text.strip_suffix(".0").map_or(text.clone(), str::to_owned)
 }
 
-/// At most `most` characters, the last of them an ellipsis where some had to go.
+/// At most `most` characters, an ellipsis in the middle where some had to go: what tells long names apart is often at their end.
 fn short(text: &str, most: usize) -> String {
-    if text.chars().count() <= most { text.to_owned() } else { text.chars().take(most - 1).chain(['…']).collect() }
+    let count = text.chars().count();
+    if count <= most {
+        return text.to_owned();
+    }
+    let (first, last) = (most / 2, most - most / 2 - 1);
+    text.chars().take(first).chain(['…']).chain(text.chars().skip(count - last)).collect()
 }
 
 fn spoken(e: &Estimate, decimals: usize) -> String {
@@ -111,7 +116,8 @@ fn spoken(e: &Estimate, decimals: usize) -> String {
     }
 }
 
-/// Dots with intervals, one row each; `mark` is a value to compare with, drawn as a dashed line.
+/// Dots with intervals, one row each; `mark` is a value to compare with, drawn as a dashed line. Names stand before their rows, or above them
+/// where one of them is too long for that.
 pub fn intervals(
     label: &str,
     rows: &[Interval],
@@ -121,9 +127,11 @@ pub fn intervals(
     decimals: usize,
 ) -> Markup {
     const WIDTH: f64 = 400.0;
-    const ROW: f64 = 25.0;
-    let (left, right, top) = (138.0, WIDTH - 46.0, 8.0);
-    let bottom = top + ROW * rows.len() as f64;
+    let above = rows.iter().any(|row| row.series.title.chars().count() > 20);
+    // Height of a row, place of its dot in it, left end of the axis.
+    let (high, dot, left) = if above { (40.0, 28.0, 8.0) } else { (25.0, 12.5, 138.0) };
+    let (right, top) = (WIDTH - 46.0, 8.0);
+    let bottom = top + high * rows.len() as f64;
     let height = bottom + 40.0;
     let x = |v: f64| axis.place(v.clamp(axis.low, axis.high), left, right);
     html! {
@@ -137,10 +145,14 @@ pub fn intervals(
                 line class="ref" x1=(n(x(mark))) x2=(n(x(mark))) y1=(n(top)) y2=(n(bottom)) {}
             }
             @for (k, row) in rows.iter().enumerate() {
-                @let y = top + ROW * (k as f64 + 0.5);
+                @let y = top + high * k as f64 + dot;
                 g class=(format!("mark {}", row.series.class)) {
                     title { (row.series.title) ": " (spoken(&row.inner, decimals)) }
-                    text class="name" x=(n(left - 10.0)) y=(n(y + 4.0)) text-anchor="end" { (short(&row.series.title, 22)) }
+                    @if above {
+                        text class="name" x=(n(left)) y=(n(y - 13.0)) { (short(&row.series.title, 60)) }
+                    } @else {
+                        text class="name" x=(n(left - 10.0)) y=(n(y + 4.0)) text-anchor="end" { (row.series.title) }
+                    }
                     @if let Some((low, high)) = row.outer {
                         line class="thin" x1=(n(x(low))) x2=(n(x(high))) y1=(n(y)) y2=(n(y)) {}
                     }

@@ -110,11 +110,11 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// The comparison of the policies.
-    pub fn verdict(&mut self, config: &Config) {
+    /// The comparison of `policies` policies.
+    pub fn verdict(&mut self, config: &Config, policies: usize) {
         let dynamics = json!(config.dynamics);
         self.step("learned dynamics", dynamics.clone());
-        self.step("verdict", dynamics);
+        self.step("verdict", json!([dynamics, "a policy"])).size = policies as f64;
     }
 
     /// Fitted Q evaluation of `policies` policies.

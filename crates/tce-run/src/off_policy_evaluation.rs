@@ -1,9 +1,12 @@
 //! Off-policy evaluation: estimates of policies from the two data sets alone, without a simulator.
 //!
 //! A policy is tried in a learned model of the target's dynamics ([`tce_learn::dynamics`]: both domains' rows, the domain as an
-//! input). An imagined episode begins at a target state, keeps to one network of the ensemble, and ends where the network says that
-//! the state is terminal, where the state has left everything that either robot has been seen in, or after as many steps as the longest
-//! target episode has.
+//! input). An imagined episode keeps to one network of the ensemble, and ends where the network says that the state is terminal, where the
+//! state has left everything that either robot has been seen in, or after as many steps as the longest target episode has.
+//!
+//! Imagined episodes begin at target states, and where the source's episodes began, if that is near the target's states ([`places::NEAR`]). A few
+//! target episodes have a few first states, which a clone knows by heart; whether it can start elsewhere is what most often decides
+//! (bench/expansion.md).
 //!
 //! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks are
 //! not to be trusted. Each later step counts the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early
@@ -26,9 +29,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tce_base::{Streams, mean_and_error, mean_std, sha256_hex};
-use tce_data::{
-    ActionRange, NeighbourOptions, Rows, Standardizer, Transitions, even_standardizer, hold_out_runs, nn_distances,
-};
+use tce_data::{ActionRange, Transitions, even_standardizer, hold_out_runs};
 use tce_learn::{
     Domain, Dynamics, DynamicsConfig, FittedQConfig, FittedValue, Learner, Policy, PolicyActions, discounted_return,
     fitted_q, rmse, train_dynamics,
@@ -39,8 +40,9 @@ use crate::error::{Error, Result};
 use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
-/// States from which a policy is tried, for each network of the ensemble.
-const STARTS: usize = 32;
+mod places;
+use places::{NEAR, bounds, distances, median, source_starts, spacing, spreads, starts};
+
 /// Share of the target rows that the ensemble does not see.
 const HELD_OUT: f64 = 0.05;
 /// A state is far from the target's states if its distance to the nearest one is more than so many times the median distance between
@@ -48,8 +50,6 @@ const HELD_OUT: f64 = 0.05;
 pub const FAR: f64 = 20.0;
 /// The quantile of the target's rewards that stands for the worst one: a single odd row decides nothing.
 const WORST: f64 = 0.01;
-/// A state further outside of everything seen than this share of a column's range ends an imagined episode.
-const MARGIN: f32 = 0.25;
 
 /// The trained ensemble, with its errors on target rows that it has not seen.
 pub struct OffPolicyEvaluator {
@@ -62,6 +62,10 @@ pub struct OffPolicyEvaluator {
     root: PathBuf,
     inputs: InputSpec,
     target: Arc<Transitions>,
+    /// With the terminal rows whose s' nobody knows: values do not need it.
+    complete: Arc<Transitions>,
+    /// The states in which imagined episodes begin.
+    starts: Vec<f32>,
     low: Vec<f32>,
     high: Vec<f32>,
     limit: usize,
@@ -135,18 +139,26 @@ impl OffPolicyEvaluator {
         };
         let tables: Vec<&Transitions> = std::iter::once(&**target).chain(source.as_deref()).collect();
         let (low, high) = bounds(&tables);
-        let longest = target.episodes().iter().map(|e| e.end - e.start).max().unwrap_or(1);
+        let complete = inputs.target.all_rows();
+        let longest = complete.episodes().iter().map(|e| e.end - e.start).max().unwrap_or(1);
         // Rows in no order do not tell how long an episode is.
         let limit = if inputs.target.has_episodes() { Some(longest) } else { inputs.step_limit() };
+        let spacing = spacing(target)?;
+        let mut first = target.select(&starts(target)).observations;
+        if let Some(source) = inputs.source.as_ref().filter(|s| s.has_episodes()) {
+            first.extend(source_starts(&source.rows, target, NEAR * spacing)?);
+        }
         Ok(Self {
             dynamics,
             held_out,
             stage,
             root: root.to_owned(),
             inputs: inputs.spec(Domains::Target),
-            spacing: spacing(target)?,
+            spacing,
+            starts: first,
             worst: worst_reward(target),
             target: target.clone(),
+            complete,
             low,
             high,
             limit: limit.unwrap_or(longest),
@@ -155,11 +167,10 @@ impl OffPolicyEvaluator {
         })
     }
 
-    /// The rows whose successor is no further from what the ensemble expects than `margin` times what 95 % of held-out real rows are.
-    pub fn possible(&self, rows: &Transitions, margin: f64) -> Vec<usize> {
+    /// Of every row, whether its successor is no further from what the ensemble expects than `margin` times what 95 % of held-out real rows are.
+    pub fn possible(&self, rows: &Transitions, margin: f64) -> Vec<bool> {
         let threshold = margin * self.held_out_error(0.95);
-        let errors = self.dynamics.errors(rows, Domain::Target);
-        (0..rows.len()).filter(|&i| errors[i] <= threshold).collect()
+        self.dynamics.errors(rows, Domain::Target).into_iter().map(|error| error <= threshold).collect()
     }
 
     /// Why no estimate can be relied on, if so.
@@ -179,10 +190,10 @@ impl OffPolicyEvaluator {
     /// Evaluates a policy in the learned model.
     pub fn evaluate(&self, policy: &Policy) -> Result<OffPolicyEstimate> {
         let t = &self.target;
-        let starts = starts(t);
         let networks = self.dynamics.members();
-        let (lanes, width, act) = (starts.len(), t.obs_dim, t.act_dim);
-        let mut states = vec![t.select(&starts).observations; networks];
+        let (width, act) = (t.obs_dim, t.act_dim);
+        let lanes = self.starts.len() / width;
+        let mut states = vec![self.starts.clone(); networks];
         let mut memories = vec![vec![policy.start(); lanes]; networks];
         let mut alive = vec![vec![true; lanes]; networks];
         let mut returns = vec![vec![0.0; lanes]; networks];
@@ -295,8 +306,10 @@ impl OffPolicyEvaluator {
             inputs: &'a InputSpec,
             policies: Vec<String>,
             config: &'a FittedQConfig,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            complete_rows: Option<usize>,
         }
-        let t = &self.target;
+        let t = &self.complete;
         let starts: Vec<usize> = t.episodes().iter().map(|e| e.start).collect();
         let first = t.select(&starts).observations;
         let actions = |policy: &Policy| PolicyActions {
@@ -308,7 +321,8 @@ impl OffPolicyEvaluator {
             sha256_hex(&a.next.iter().chain(&a.start).flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
         };
         // Its actions at these rows are all that decides a policy's value.
-        let spec = Spec { inputs: &self.inputs, policies: actions.iter().map(hash).collect(), config };
+        let complete_rows = (t.len() > self.target.len()).then_some(t.len());
+        let spec = Spec { inputs: &self.inputs, policies: actions.iter().map(hash).collect(), config, complete_rows };
         tce_base::begin_step("fitted Q");
         let stage = Stage::open(&self.root, "stages/fitted-q", &spec, device)?;
         if let Some(values) = stage.summary()? {
@@ -324,7 +338,7 @@ impl OffPolicyEvaluator {
 
     /// The discounted return of the target's episodes as they were logged, to hold fitted values against.
     pub fn behaviour_value(&self, config: &FittedQConfig) -> f64 {
-        discounted_return(&self.target, config.discount)
+        discounted_return(&self.complete, config.discount)
     }
 }
 
@@ -351,105 +365,9 @@ fn worst_reward(target: &Transitions) -> f64 {
     rewards.get((rewards.len() as f64 * WORST) as usize).map_or(0.0, |&r| f64::from(r).min(0.0))
 }
 
-/// Where imagined episodes begin: the first states of all target episodes, and evenly spaced ones.
-fn starts(target: &Transitions) -> Vec<usize> {
-    let mut rows: Vec<usize> = target.episodes().iter().map(|e| e.start).take(STARTS).collect();
-    let more = STARTS.saturating_sub(rows.len()).min(target.len());
-    rows.extend((0..more).map(|i| i * target.len() / more));
-    rows
-}
-
-/// The least and the greatest value of every column over all states, with a margin.
-fn bounds(tables: &[&Transitions]) -> (Vec<f32>, Vec<f32>) {
-    let width = tables.first().map_or(0, |t| t.obs_dim);
-    let (mut low, mut high) = (vec![f32::INFINITY; width], vec![f32::NEG_INFINITY; width]);
-    for row in
-        tables.iter().flat_map(|t| t.observations.chunks_exact(width).chain(t.next_observations.chunks_exact(width)))
-    {
-        for ((low, high), &x) in low.iter_mut().zip(&mut high).zip(row) {
-            (*low, *high) = (low.min(x), high.max(x));
-        }
-    }
-    for (low, high) in low.iter_mut().zip(&mut high) {
-        let margin = MARGIN * (*high - *low);
-        (*low, *high) = (*low - margin, *high + margin);
-    }
-    (low, high)
-}
-
-/// The spreads of a target's columns, in which distances are measured.
-fn spreads(target: &Transitions) -> Standardizer {
-    Standardizer::fit(&target.observations, target.obs_dim)
-}
-
-/// Distance of every state of `rows` to the nearest state of `target`, in spreads of columns.
-fn distances(rows: &Transitions, target: &Transitions, scale: &Standardizer) -> Result<Vec<f32>> {
-    let of = |t: &Transitions| scale.apply(&t.observations);
-    let (rows, target) = (of(rows), of(target));
-    let width = scale.dim();
-    Ok(nn_distances(&Rows::new(&rows, width), &Rows::new(&target, width), &NeighbourOptions::default())?)
-}
-
-fn median(mut values: Vec<f32>) -> f64 {
-    values.sort_by(f32::total_cmp);
-    values.get(values.len() / 2).map_or(f64::NAN, |&v| f64::from(v))
-}
-
-/// Parts of the target whose distance from the rest is measured.
-const PARTS: usize = 8;
-
-/// The median distance between a target state and the nearest one of another episode, or of another eighth of the episodes where there are
-/// more than eight; of the other half, where there is one episode.
-fn spacing(target: &Transitions) -> Result<f64> {
-    let starts: Vec<usize> = target.episodes().iter().map(|e| e.start).collect();
-    let parts = starts.len().min(PARTS);
-    let cuts: Vec<usize> = match parts {
-        0 | 1 => vec![0, target.len() / 2],
-        _ => (0..parts).map(|k| starts[k * starts.len() / parts]).collect(),
-    };
-    let scale = spreads(target);
-    let mut all = Vec::with_capacity(target.len());
-    for (k, &cut) in cuts.iter().enumerate() {
-        let end = cuts.get(k + 1).copied().unwrap_or(target.len());
-        let (one, rest): (Vec<usize>, Vec<usize>) = (0..target.len()).partition(|i| (cut..end).contains(i));
-        if !one.is_empty() && !rest.is_empty() {
-            all.extend(distances(&target.select(&one), &target.select(&rest), &scale)?);
-        }
-    }
-    Ok(if all.is_empty() { 1.0 } else { median(all).max(1e-6) })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Episodes of so many rows along a line; each is `apart` from the one before, in the second column.
-    fn episodes(lengths: &[usize], apart: f32) -> Transitions {
-        let mut t = Transitions::new(2, 1);
-        for (k, &length) in lengths.iter().enumerate() {
-            for i in 0..length {
-                let x = 100.0 * i as f32 / length as f32;
-                t.push(&[x, k as f32 * apart], &[0.0], 0.0, &[x, k as f32 * apart], false, i + 1 == length);
-            }
-        }
-        t
-    }
-
-    #[test]
-    fn the_spacing_of_a_target_is_that_of_all_of_its_episodes() {
-        let usual = spacing(&episodes(&[200; 5], 1.0)).unwrap();
-        // A last episode that was stopped at once stands where the others do; it decides nothing.
-        let stopped = spacing(&episodes(&[200, 200, 200, 200, 200, 1], 1.0)).unwrap();
-        assert!((stopped / usual - 1.0).abs() < 0.25, "{usual} {stopped}");
-        // A column that is constant in an episode counts in spreads, whatever its unit.
-        let (near, far) = (spacing(&episodes(&[200; 2], 0.1)).unwrap(), spacing(&episodes(&[200; 2], 1e3)).unwrap());
-        assert!((near / far - 1.0).abs() < 1e-3 && near > 0.5, "{near} {far}");
-        // Of one episode, its halves; of a single row, nothing.
-        assert!(spacing(&episodes(&[200], 1.0)).unwrap() > 0.1);
-        assert_eq!(spacing(&episodes(&[1], 1.0)).unwrap(), 1.0);
-        // Many short episodes are taken together.
-        assert!(spacing(&episodes(&[3; 300], 0.01)).unwrap() > 0.0);
-    }
 
     #[test]
     fn leaving_the_data_early_never_pays() {

@@ -7,9 +7,9 @@ use std::path::Path;
 
 use clap::Args;
 use serde::Serialize;
-use tce_base::FileError;
+use tce_base::{AtomicFolder, FileError, move_into_place};
 use tce_data::{
-    ActionRange, Agent, DataError, LoadOptions, Shift, Transitions, parse_environment, save_d4rl, save_minari,
+    ActionRange, Agent, DataError, LoadOptions, Problem, Shift, Transitions, parse_environment, save_d4rl, save_minari,
 };
 use tce_sim::EPISODE_LIMIT;
 
@@ -114,11 +114,46 @@ pub struct Writing {
     pub force: bool,
 }
 
+/// The files of a Minari data set, in the folder `data` of its own: the rows, and what they are.
+const MINARI: [&str; 2] = ["main_data.hdf5", "metadata.json"];
+
 impl Writing {
+    /// Refuses a place with something of another kind than what is written. Call it before long work whose result goes there.
+    ///
+    /// # Errors
+    /// Says what is there: a folder where a file is written, a file where a folder is written, or, in the folder, a `data` that is not a data
+    /// set alone: nobody would expect that other files go with it.
+    pub fn ensure_replaceable(&self, path: &Path) -> Result<(), DataError> {
+        let refuse = |place: &Path, found: String, expected: &str| {
+            Err(DataError::Invalid {
+                problem: Problem::Value,
+                file: place.to_owned(),
+                field: "file".into(),
+                found,
+                expected: expected.into(),
+                advice: "Nothing was written; choose another name".into(),
+            })
+        };
+        let data = path.join("data");
+        match self.format {
+            DataFormat::D4rl if path.is_dir() => {
+                refuse(path, "a folder".into(), "the name of a file, which the layout d4rl is")
+            }
+            DataFormat::Minari if path.exists() && !path.is_dir() => {
+                refuse(path, "a file".into(), "the name of a folder, which the layout minari is")
+            }
+            DataFormat::Minari if data.exists() => {
+                let other = if data.is_dir() { not_of_minari(&data)? } else { Some("a file".into()) };
+                other.map_or(Ok(()), |found| refuse(&data, found, "a Minari data set and nothing else"))
+            }
+            DataFormat::D4rl | DataFormat::Minari => Ok(()),
+        }
+    }
+
     /// Writes `rows`, in the units of the user's actions, whose range is `range`. Minari takes no `attributes` and no `columns`.
     ///
     /// # Errors
-    /// What [`save_d4rl`] and [`save_minari`] refuse.
+    /// What [`save_d4rl`], [`save_minari`] and [`Self::ensure_replaceable`] refuse.
     pub fn write(
         &self,
         path: &Path,
@@ -127,24 +162,61 @@ impl Writing {
         attributes: &BTreeMap<String, String>,
         columns: &[(&str, &[f32])],
     ) -> Result<(), DataError> {
+        self.ensure_replaceable(path)?;
         match self.format {
             DataFormat::D4rl => save_d4rl(path, rows, attributes, columns),
             DataFormat::Minari => {
                 let id = self.id.clone().unwrap_or_else(|| id_of(path));
-                if !self.force || !path.exists() {
-                    return save_minari(path, &id, rows, range);
+                match self.force && path.exists() {
+                    true => replace_minari(path, &id, rows, range),
+                    false => save_minari(path, &id, rows, range),
                 }
-                // The new data first, beside the old; whatever else is in the folder stays.
-                let io = |e| FileError::new(path, "replace the data of", e);
-                let fresh =
-                    path.with_file_name(format!(".{}.new", path.file_name().unwrap_or_default().to_string_lossy()));
-                let _ = fs::remove_dir_all(&fresh);
-                save_minari(&fresh, &id, rows, range)?;
-                let _ = fs::remove_dir_all(path.join("data"));
-                fs::rename(fresh.join("data"), path.join("data")).map_err(io)?;
-                Ok(fs::remove_dir(&fresh).map_err(io)?)
             }
         }
+    }
+}
+
+/// What makes the folder `data` something else than that of a Minari data set; None: it is one, or empty.
+fn not_of_minari(data: &Path) -> Result<Option<String>, FileError> {
+    let io = |e| FileError::new(data, "read the folder", e);
+    let entries = fs::read_dir(data).map_err(io)?.collect::<Result<Vec<_>, _>>().map_err(io)?;
+    let mut names: Vec<String> = entries.iter().map(|e| e.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    let other = names.iter().find(|name| !MINARI.contains(&name.as_str()));
+    let whole = names.is_empty() || names.iter().any(|name| name == MINARI[0]);
+    Ok(match other {
+        Some(other) => Some(format!("{other} in it")),
+        None => (!whole).then(|| format!("no {} in it", MINARI[0])),
+    })
+}
+
+/// Writes a Minari data set into the folder `path`, which is there. The two files of an old one are replaced, each in one step, when the new
+/// ones are complete; whatever else is in the folder stays.
+fn replace_minari(path: &Path, id: &str, rows: &Transitions, range: Option<&ActionRange>) -> Result<(), DataError> {
+    let data = path.join("data");
+    // Inside of the folder: a rename from there cannot cross devices. It goes away with all that was not renamed.
+    let temporary = AtomicFolder::create(&data)?;
+    let set = temporary.path().join("set");
+    save_minari(&set, id, rows, range).map_err(|error| under_the_name(path, error))?;
+    let fresh = set.join("data");
+    if !data.exists() {
+        return Ok(move_into_place(&fresh, &data)?);
+    }
+    for name in MINARI {
+        move_into_place(&fresh.join(name), &data.join(name))?;
+    }
+    Ok(())
+}
+
+/// The same error of `path`: nobody knows the temporary folder that it was met in.
+fn under_the_name(path: &Path, error: DataError) -> DataError {
+    let file = path.to_owned();
+    match error {
+        DataError::Invalid { problem, field, found, expected, advice, .. } => {
+            DataError::Invalid { problem, file, field, found, expected, advice }
+        }
+        DataError::File(FileError { action, source, .. }) => FileError { path: file, action, source }.into(),
+        interrupted => interrupted,
     }
 }
 
@@ -207,6 +279,42 @@ mod tests {
         }
         for id in ["bad id", "", "noversion", "../x-v0", "w/o-v0", "lab/-v0", "lab//x-v0"] {
             assert!(parse_id(id).is_err(), "{id}");
+        }
+    }
+
+    #[test]
+    fn only_a_data_set_gives_way_to_a_data_set() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = |name: &str| dir.path().join(name);
+        let mut rows = Transitions::new(1, 1);
+        (0..3).for_each(|i| rows.push(&[i as f32], &[0.0], 0.0, &[i as f32 + 1.0], false, i == 2));
+        let write = |format, name: &str| {
+            let writing = Writing { format, id: None, force: true };
+            writing.write(&place(name), &rows, None, &BTreeMap::new(), &[]).map_err(|e| e.to_string())
+        };
+        fs::write(place("file"), "mine").unwrap();
+        for folder in ["empty", "half/data", "mixed/data"] {
+            fs::create_dir_all(place(folder)).unwrap();
+        }
+        for file in ["half/data/metadata.json", "mixed/data/main_data.hdf5", "mixed/data/raw.hdf5"] {
+            fs::write(place(file), "mine").unwrap();
+        }
+        for (format, name, found) in [
+            (DataFormat::D4rl, "empty", "found a folder"),
+            (DataFormat::Minari, "file", "found a file"),
+            (DataFormat::Minari, "half", "found no main_data.hdf5 in it"),
+            (DataFormat::Minari, "mixed", "found raw.hdf5 in it"),
+        ] {
+            let refused = write(format, name).unwrap_err();
+            assert!(refused.contains(found) && refused.contains("choose another name"), "{name}: {refused}");
+        }
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 4, "nothing is left behind");
+        assert_eq!(fs::read(place("mixed/data/raw.hdf5")).unwrap(), b"mine");
+        // An empty folder is filled, and what was written is written again.
+        for _ in 0..2 {
+            write(DataFormat::Minari, "empty").unwrap();
+            assert_eq!(fs::read_dir(place("empty")).unwrap().count(), 1);
+            assert_eq!(fs::read_dir(place("empty/data")).unwrap().count(), 2);
         }
     }
 

@@ -10,6 +10,7 @@ use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
 use tce_learn::{DynamicsConfig, Mode, RowScores};
 use tce_nn::Device;
+use tce_report::analysis::DIVERGED;
 use tce_zoo::actors::{Arena, Evaluation};
 
 use crate::augment::single_stage;
@@ -50,6 +51,13 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// What the seeds' policies count for: their scores, and [`DIVERGED`] for a policy that could not act to the end.
+    pub fn counted(&self) -> Vec<f64> {
+        let of =
+            |(score, evaluation): (&Option<f64>, &Evaluation)| score.or(evaluation.failed.as_ref().map(|_| DIVERGED));
+        self.scores.iter().zip(&self.learned.evaluations).filter_map(of).collect()
+    }
+
     /// The policies' files, one per seed.
     pub fn policies(&self) -> Vec<PathBuf> {
         self.seeds.iter().map(|seed| self.directory.join(policy_file(*seed))).collect()
@@ -87,6 +95,29 @@ impl<'a> RunSpec<'a> {
             labels: (two_stages || relabelled).then_some(&config.labels),
             dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
             joint: used_of_single_stage(&config.single_stage, config.mixture.generated, config.learner.algorithm),
+        }
+    }
+}
+
+impl Config {
+    /// Whether runs of this configuration look at the setting of this full name; the same keys as in [`RunSpec`].
+    pub fn uses(&self, key: &str) -> bool {
+        let (section, rest) = key.split_once('.').unwrap_or((key, ""));
+        let table = rest.split('.').next().unwrap_or_default();
+        let two_stages = self.mixture.generated == GeneratedRows::Tce;
+        match section {
+            "generator" | "filter" => two_stages,
+            "labels" => two_stages || self.mixture.source == SourceRows::Relabelled,
+            "dynamics" => two_stages && self.filter.by_dynamics(),
+            "single_stage" => {
+                let used = used_of_single_stage(&self.single_stage, self.mixture.generated, self.learner.algorithm);
+                used.is_some_and(|used| used.get(table).is_some())
+            }
+            "learner" => self.learner.used().get(table).is_some(),
+            "source" => self.needs_source(),
+            // Verdicts on files of one's own alone.
+            "fitted_q" => false,
+            _ => true,
         }
     }
 }

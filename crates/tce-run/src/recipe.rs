@@ -32,7 +32,8 @@ fn flat(table: &toml::Table, prefix: &str, out: &mut BTreeMap<String, String>) {
     for (key, value) in table {
         let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
         match value {
-            toml::Value::Table(inner) => flat(inner, &name, out),
+            // The keys of a table depend on its kind, so that it is one setting.
+            toml::Value::Table(inner) if !inner.contains_key("kind") => flat(inner, &name, out),
             value => {
                 out.insert(name, value.to_string());
             }
@@ -51,12 +52,20 @@ const LEFT_OUT: [(&str, &str); 6] = [
     ("filter.margin", "2.0"),
 ];
 
+fn table(text: &str) -> Option<toml::Table> {
+    let mut table = text.parse::<toml::Table>().ok()?;
+    with_current_names(&mut table);
+    Some(table)
+}
+
+/// None where another version wrote the text, with other keys.
+fn config(text: &str) -> Option<Config> {
+    table(text)?.try_into().ok()
+}
+
 fn settings(text: &str) -> BTreeMap<String, String> {
     let mut out: BTreeMap<String, String> = LEFT_OUT.map(|(k, v)| (k.to_owned(), v.to_owned())).into();
-    if let Ok(mut table) = text.parse::<toml::Table>() {
-        with_current_names(&mut table);
-        flat(&table, "", &mut out);
-    }
+    table(text).iter().for_each(|table| flat(table, "", &mut out));
     out
 }
 
@@ -73,14 +82,18 @@ fn presets(task: Task, variant: Variant) -> Vec<Known> {
     [Preset::Default, Preset::Quick, Preset::Paper].iter().filter_map(known).collect()
 }
 
-/// What differs; what only one of them has is another version's and no difference. None if they have less than half of the preset's
-/// settings in common.
-fn changes(own: &BTreeMap<String, String>, preset: &BTreeMap<String, String>) -> Option<Vec<Change>> {
+/// What differs of the settings that are `used`; what only one of them has is another version's and no difference. None if they have less
+/// than half of the preset's settings in common.
+fn changes(
+    own: &BTreeMap<String, String>,
+    preset: &BTreeMap<String, String>,
+    used: impl Fn(&str) -> bool,
+) -> Option<Vec<Change>> {
     let common: Vec<_> = preset.iter().filter_map(|(key, value)| Some((key, own.get(key)?, value))).collect();
     if 2 * common.len() < preset.len() {
         return None;
     }
-    let differ = common.into_iter().filter(|(_, a, b)| a != b);
+    let differ = common.into_iter().filter(|(key, a, b)| a != b && used(key));
     let change = |(key, value, preset): (&String, &String, &String)| Change {
         key: key.clone(),
         value: value.clone(),
@@ -97,13 +110,15 @@ impl Recipes {
         if let Some(recipe) = self.found.get(&key) {
             return recipe.clone();
         }
-        let learner = toml::from_str::<Config>(&folder.config).ok().map(|c| budget(&c, rows));
+        let config = config(&folder.config);
+        let learner = config.as_ref().map(|c| budget(c, rows));
         let mut recipe = Recipe { learner, ..Recipe::default() };
         if let Ok(variant) = Variant::from_str(variant, false) {
             let place = (key.0.clone(), key.1.clone());
             let known = self.presets.entry(place).or_insert_with(|| presets(task, variant));
             let own = settings(&folder.config);
-            let nearest = known.iter().filter_map(|k| Some((k, changes(&own, &k.settings)?)));
+            let used = |key: &str| config.as_ref().is_none_or(|c| c.uses(key));
+            let nearest = known.iter().filter_map(|k| Some((k, changes(&own, &k.settings, used)?)));
             if let Some((preset, changed)) = nearest.min_by_key(|(_, changed)| changed.len()) {
                 (recipe.preset, recipe.changed) = (Some(preset.name.clone()), changed);
             }
@@ -129,9 +144,10 @@ mod tests {
     /// The settings of `preset` with `sets`, recognised.
     fn found(preset: Preset, variant: Variant, sets: &[&str]) -> Option<(String, Vec<String>)> {
         let sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
-        let own = Layered::new(preset, Some(task()), Some(variant), None, &sets).unwrap().config().unwrap().to_toml();
-        let known = presets(task(), variant);
-        let nearest = known.iter().filter_map(|k| Some((k.name.clone(), changes(&settings(&own), &k.settings)?)));
+        let own = Layered::new(preset, Some(task()), Some(variant), None, &sets).unwrap().config().unwrap();
+        let (known, settings) = (presets(task(), variant), settings(&own.to_toml()));
+        let used = |key: &str| own.uses(key);
+        let nearest = known.iter().filter_map(|k| Some((k.name.clone(), changes(&settings, &k.settings, used)?)));
         let (name, changed) = nearest.min_by_key(|(_, changed)| changed.len())?;
         Some((name, changed.iter().map(ToString::to_string).collect()))
     }
@@ -150,12 +166,28 @@ mod tests {
             (Preset::Default, "learner.bc.batch=0", "learner.bc.batch = 0 (128)"),
             (Preset::Default, "learner.bc.loss=likelihood", "learner.bc.loss = \"likelihood\" (\"squared\")"),
             (Preset::Default, "learner.bc.dropout=0.2", "learner.bc.dropout = 0.2 (\"auto\")"),
-            (Preset::Default, "filter.by=consistency", "filter.by = \"consistency\" (\"zscore\")"),
-            (Preset::Default, "filter.margin=3.5", "filter.margin = 3.5 (2.0)"),
             (Preset::Paper, "learner.bc.batch=64", "learner.bc.batch = 64 (0)"),
         ] {
             assert_eq!(found(preset, Variant::Bc, &[set]).unwrap().1, [told]);
         }
-        assert_eq!(changes(&settings("a = 1"), &presets(task(), Variant::Bc)[0].settings), None);
+        for (set, told) in [
+            ("filter.by=consistency", "filter.by = \"consistency\" (\"zscore\")"),
+            ("filter.margin=3.5", "filter.margin = 3.5 (2.0)"),
+        ] {
+            assert_eq!(found(Preset::Default, Variant::TceOg, &[set]).unwrap().1, [told]);
+            assert_eq!(found(Preset::Default, Variant::Bc, &[set]).unwrap().1, [""; 0], "a clone does not filter");
+        }
+        assert_eq!(changes(&settings("a = 1"), &presets(task(), Variant::Bc)[0].settings, |_| true), None);
+    }
+
+    /// The keys of a sampler hang on its kind, so that the whole table is given, in a form that `--set` reads.
+    #[test]
+    fn a_table_of_another_kind_is_one_change() {
+        let sampler = "generator.sampler={ kind = \"predictor-corrector\", steps = 100, snr = 0.3 }";
+        let (_, changed) = found(Preset::Default, Variant::TceOg, &[sampler]).unwrap();
+        let [told] = &changed[..] else { panic!("one change: {changed:?}") };
+        let set = told.split_once(" (").unwrap().0;
+        assert!(set.starts_with("generator.sampler = {") && set.contains("snr = 0.3"), "{told}");
+        assert_eq!(found(Preset::Default, Variant::TceOg, &[set]).unwrap().1, changed);
     }
 }

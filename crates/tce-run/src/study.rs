@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use serde_json::Value;
-use tce_base::{FileError, sha256_hex};
+use tce_base::FileError;
 use tce_data::{Task, parse_agent};
 use tce_diagnosis::Diagnosis;
 use tce_learn::Mode;
 use tce_report::folder::Verdict;
-use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, mixed, record};
+use tce_report::{Cost, Method, Missing, Recommended, ReportError, RunFolder, Study, merge, record};
 
 use crate::config::Config;
 use crate::diagnosis;
@@ -21,24 +21,37 @@ use crate::sweep::gather::Checked;
 use crate::sweep::{Entry, Kind, Sweep};
 use crate::variant::Variant;
 
+mod columns;
+use columns::{Finished, columns};
+
 /// Everything that `places` hold for a report, as one study: sweeps' folders, folders of `tce run`, records, and folders of records.
 ///
 /// # Errors
 /// If one of them is none of these, or a file in it is damaged.
 pub fn of_places(places: &[PathBuf]) -> Result<Study> {
-    let mut studies = Vec::new();
+    let (mut studies, mut recipes) = (Vec::new(), Recipes::default());
     for place in places {
         if place.join("manifest.jsonl").exists() {
-            studies.push(of_sweep(&Sweep::open(place)?)?);
+            studies.push(of_sweep(&Sweep::open(place)?, &mut recipes)?);
             continue;
         }
         let records = records(place)?;
         // A folder may hold both.
         if records.is_empty() || (place.is_dir() && directories(place)?.iter().any(|d| task_of(d).is_some())) {
-            studies.push(of_runs(place)?);
+            studies.push(of_runs(place, &mut recipes)?);
         }
         for path in records {
-            studies.push(record::read(&path)?);
+            let mut study = record::read(&path)?;
+            // Beside the presets of this program: those of the one that wrote the record may have been others.
+            for run in &mut study.runs {
+                let variant = study.methods.iter().find(|m| m.id == run.method).map_or("", |m| m.variant.as_str());
+                let recipe = recipes.of(run.task, variant, &run.folder);
+                // Without its settings it has the recipe that was written down.
+                if !run.folder.config.is_empty() {
+                    run.recipe = recipe;
+                }
+            }
+            studies.push(study);
         }
     }
     Ok(merge(studies))
@@ -100,7 +113,7 @@ fn in_order(mut methods: Vec<Method>) -> Vec<Method> {
     methods
 }
 
-fn of_sweep(sweep: &Sweep) -> Result<Study> {
+fn of_sweep(sweep: &Sweep, recipes: &mut Recipes) -> Result<Study> {
     let runs = || sweep.entries().iter().filter(|e| e.kind == Kind::Run);
     let mut methods: Vec<Method> = Vec::new();
     for (variant, entry) in runs().filter_map(|e| Some((e.variant?, e))) {
@@ -112,7 +125,6 @@ fn of_sweep(sweep: &Sweep) -> Result<Study> {
     let mut notes = Vec::new();
     let diagnoses = diagnoses(&sweep.directory.join("runs"), &mut notes);
     let recommended = verdicts(sweep, &mut notes);
-    let mut recipes = Recipes::default();
     let mut study = Study {
         sweep: true,
         methods: in_order(methods),
@@ -241,8 +253,8 @@ pub fn task_of(directory: &Path) -> Option<Task> {
     name_of(directory).replacen('_', ":", 1).replace("-to-", "->").parse().ok()
 }
 
-fn of_runs(directory: &Path) -> Result<Study> {
-    let mut finished: Vec<(Task, String, RunFolder)> = Vec::new();
+fn of_runs(directory: &Path, recipes: &mut Recipes) -> Result<Study> {
+    let mut finished: Vec<Finished> = Vec::new();
     let mut missing: Vec<Missing> = Vec::new();
     for (of, place) in directories(directory)?.iter().filter_map(|p| Some((task_of(p)?, p))) {
         for run in directories(place)? {
@@ -257,7 +269,10 @@ fn of_runs(directory: &Path) -> Result<Study> {
                 None => lost("not finished: no done.json".into()),
                 Some(folder) => match folder.damage() {
                     Some(what) => lost(format!("corrupt: {what}")),
-                    None => finished.push((of, name.to_owned(), folder)),
+                    None => {
+                        let recipe = recipes.of(of, name, &folder);
+                        finished.push(Finished { task: of, name: name.to_owned(), folder, recipe });
+                    }
                 },
             }
         }
@@ -272,12 +287,12 @@ fn of_runs(directory: &Path) -> Result<Study> {
     let mut notes = Vec::new();
     let ids = columns(&finished, &mut notes);
     let mut methods: Vec<Method> = Vec::new();
-    for (name, id) in finished.iter().map(|f| &f.1).zip(&ids).chain(missing.iter().map(|m| (&m.method, &m.method))) {
+    for (name, id) in finished.iter().map(|f| &f.name).zip(&ids).chain(missing.iter().map(|m| (&m.method, &m.method))) {
         if methods.iter().any(|m| m.id == *id) {
             continue;
         }
         let label = id.strip_prefix(name.as_str()).unwrap_or_default().trim();
-        let folder = finished.iter().zip(&ids).find(|(_, of)| *of == id).map(|((_, _, folder), _)| folder);
+        let folder = finished.iter().zip(&ids).find(|(_, of)| *of == id).map(|(run, _)| &run.folder);
         // As above.
         let config = folder.and_then(|f| toml::from_str(&f.config).ok());
         methods.push(match Variant::from_str(name, false) {
@@ -300,46 +315,17 @@ fn of_runs(directory: &Path) -> Result<Study> {
         recommended,
         ..Study::new(name, directory.display().to_string())
     };
-    let mut recipes = Recipes::default();
-    for ((of, name, folder), id) in finished.into_iter().zip(ids) {
+    for (Finished { task, folder, recipe, .. }, id) in finished.into_iter().zip(ids) {
         study.costs.push(Cost {
             stage: training_stage(&method_title(&study.methods, &id)),
-            agent: of.agent,
+            agent: task.agent,
             seconds: folder.learning_seconds,
             seeds: folder.members.len(),
             memory: None,
         });
-        let recipe = recipes.of(of, &name, &folder);
-        study.add(of, &id, folder, &recipe);
+        study.add(task, &id, folder, &recipe);
     }
     Ok(study)
-}
-
-/// The column of every finished run: its name. Where a task has runs of one name that are no seeds of one work, they differ in their
-/// settings or their data, and all settings, all data, or else all folders of that name are columns of their own.
-fn columns(finished: &[(Task, String, RunFolder)], notes: &mut Vec<String>) -> Vec<String> {
-    let mut ids: Vec<String> = finished.iter().map(|(_, name, _)| name.clone()).collect();
-    let marks: [fn(&RunFolder) -> String; 3] = [
-        |f| f.config_hash[..6].to_owned(),
-        |f| sha256_hex(serde_json::json!(f.inputs).to_string().as_bytes())[..6].to_owned(),
-        |f| name_of(&f.directory).rsplit('-').next().unwrap_or_default().to_owned(),
-    ];
-    for mark in marks {
-        let members = finished.iter().zip(&ids).flat_map(|((of, _, folder), id)| {
-            folder.members.iter().map(move |member| (*of, id.as_str(), folder, member.seed))
-        });
-        let mixed = mixed(members);
-        for ((_, name, folder), id) in finished.iter().zip(&mut ids).filter(|(_, id)| mixed.contains(*id)) {
-            *id = format!("{id} {}", mark(folder));
-            let note = format!(
-                "{name}: a task has several runs with different settings or data; each is a column of its own."
-            );
-            if !notes.contains(&note) {
-                notes.push(note);
-            }
-        }
-    }
-    ids
 }
 
 fn json(path: &Path) -> Option<Value> {
@@ -467,7 +453,7 @@ mod tests {
         manifest.header.configs.values_mut().for_each(|config| *config = format!("from_another_version = 1\n{config}"));
         let sweep = Sweep::create(&dir.path().join("sweep"), manifest).unwrap();
         assert!(sweep.manifest.config(&sweep.entries()[0]).is_err());
-        let study = of_sweep(&sweep).unwrap();
+        let study = of_sweep(&sweep, &mut Recipes::default()).unwrap();
         assert!(study.methods.iter().any(|m| m.title == "DARA (published)"), "{:?}", study.methods);
     }
 

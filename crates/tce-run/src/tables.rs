@@ -7,12 +7,16 @@ use std::sync::Arc;
 
 use serde::Serialize;
 use tce_base::{sha256_file, sha256_parts};
-use tce_data::{ActionRange, LoadOptions, Loaded, ReferenceScores, Standardizer, Transitions, load, main_file};
+use tce_data::{
+    ActionRange, LoadOptions, Loaded, ReferenceScores, Standardizer, Transitions, load, main_file, read_attributes,
+};
 
 use crate::error::{Error, Result};
 
 /// Below this, nothing can be held out and nothing be learned.
 const LEAST_ROWS: usize = 10;
+/// An attribute of every file of `tce augment`, whose column `origin` tells target rows (0) from others.
+const AUGMENTED: &str = "target_sha256";
 
 /// A loaded file.
 #[derive(Clone, Debug)]
@@ -75,10 +79,16 @@ impl Table {
     pub(crate) fn besides(path: &Path, options: &LoadOptions, target: &Self) -> Result<Self> {
         let options = LoadOptions { all_columns: true, ..options.clone() };
         let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
-        Self::without_target(transitions.into(), columns.get("origin").map(Vec::as_slice), path, hash, target)
+        // In a file of the user's own a column of this name may mean anything.
+        let ours = || read_attributes(path).is_ok_and(|attributes| attributes.contains_key(AUGMENTED));
+        let origin = columns.get("origin").filter(|_| ours());
+        Self::without_target(transitions.into(), origin.map(Vec::as_slice), path, hash, target)
     }
 
     /// The rows that are not the target's: neither marked by `origin` as such, nor equal to one.
+    ///
+    /// # Errors
+    /// If the rows are of another robot, or all of them are the target's.
     pub(crate) fn without_target(
         rows: Arc<Transitions>,
         origin: Option<&[f32]>,
@@ -91,6 +101,18 @@ impl Table {
             parts.into_iter().flatten().map(|x| x.to_bits()).collect()
         };
         let own = target.complete();
+        if (rows.obs_dim, rows.act_dim) != (own.obs_dim, own.act_dim) {
+            return Err(Error::Failed(format!(
+                "{}: found extra rows of {} observations and {} actions, expected {} and {} as in the target, {}; give --extra (Python: extra=) \
+                 rows of the same robot",
+                file.display(),
+                rows.obs_dim,
+                rows.act_dim,
+                own.obs_dim,
+                own.act_dim,
+                target.file.display()
+            )));
+        }
         let known: HashSet<Vec<u32>> = (0..own.len()).map(|i| bits(own, i)).collect();
         let is_target = |i: usize| origin.is_some_and(|o| o[i] == 0.0) || known.contains(bits(&rows, i).as_slice());
         let others: Vec<usize> = (0..rows.len()).filter(|&i| !is_target(i)).collect();

@@ -9,16 +9,16 @@
 //! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | metrics, settings, inputs of the key, results |
 //! | `learned.json` | that a training came to its end, here and in `baseline/` |
 //!
-//! A second call with the same directory returns the finished run, or does what is missing: finished trainings are not done again, others
-//! go on from their checkpoints. Paths in files are relative to the directory, which can be moved.
+//! A second call with the same directory returns the finished run, or does what is missing or was changed: finished trainings are not done
+//! again, others go on from their checkpoints. Paths in files are relative to the directory, which can be moved.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::{first_damaged, read_if_there, read_json, sha256_files, sha256_hex, write_json};
-use tce_data::ScoreTable;
-use tce_learn::{LearnedRows, OtherRows};
+use tce_data::{ScoreTable, Transitions};
+use tce_learn::{LearnedRows, OtherRows, Policy};
 use tce_nn::Device;
 use tce_zoo::actors::Arena;
 
@@ -31,10 +31,16 @@ use crate::methods::row_scores;
 use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
 use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
-use crate::verdict::{Candidate, Kept, keep, only, recommend};
+use crate::verdict::{Candidate, Kept, Verdict, keep, only, recommend};
 
 /// The name of the baseline: clones of the target rows alone.
 const BASELINE: &str = "cloning the target rows";
+/// The folder of the baseline.
+const BASELINE_FOLDER: &str = "baseline";
+/// The file of the settings.
+const CONFIG: &str = "config.toml";
+/// The file of all inputs that decide the result; the first one of a run.
+const SPEC: &str = "spec.json";
 
 /// Whether the policies are compared, with each other and with a baseline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -106,6 +112,31 @@ impl Done {
         let done: Option<Self> = read_json(&directory.join(LEARNED), "remove it to train again")?;
         Ok(done.filter(|d| d.key == key && first_damaged(directory, &d.policies).is_none()))
     }
+
+    /// Whether the policies of the finished training `key` are in `directory`, as they were.
+    fn is_intact(directory: &Path, key: &str, seeds: &[u64]) -> Result<bool> {
+        if directory.join(LEARNED).exists() {
+            return Ok(Self::read(directory, key)?.is_some());
+        }
+        // Trainings of earlier versions, which did not write this file, stay finished.
+        Ok(seeds.iter().all(|&seed| Policy::load(&directory.join(policy_file(seed))).is_ok()))
+    }
+}
+
+/// Refuses a directory with a file of settings that no run wrote: the run's own would replace it.
+///
+/// # Errors
+/// Names the file.
+pub fn ensure_own_folder(out: &Path) -> Result<()> {
+    let config = out.join(CONFIG);
+    if config.exists() && !out.join(SPEC).exists() {
+        return Err(Error::Usage(format!(
+            "{}: found a file that no training wrote (there is no {SPEC} beside it), expected none: the settings of this training would \
+             replace it. Choose another folder for the results, or move the file",
+            config.display()
+        )));
+    }
+    Ok(())
 }
 
 /// Refuses options that `learner` has no use for, and a training without other `rows` that it needs.
@@ -148,20 +179,21 @@ impl TrainingRun<'_> {
     /// # Errors
     /// If the learner needs other rows than there are, the directory holds another run, training fails, or the user interrupts.
     pub fn run(&self, inputs: &Inputs, device: &Device) -> Result<Trained> {
+        ensure_own_folder(self.out)?;
         ensure_fits(&self.config.learner, LearnedRows::with(inputs.extra.as_ref()))?;
         inputs.ensure_episodes(&self.config.learner)?;
         let (out, seeds) = (self.out, self.seeds);
         let method = self.config.learner.algorithm.about();
         let spec = self.spec(inputs, device);
         let key = sha256_hex(without_source(&spec).to_string().as_bytes());
-        if let Some(trained) = found(out, &spec, self.comparison)? {
+        if let Some(trained) = self.found(&spec, &key)? {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
         }
         let data = self.members(inputs)?;
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
-        write_json(&out.join("spec.json"), &spec)?;
-        tce_base::write_atomically(&out.join("config.toml"), self.config.to_toml().as_bytes())?;
+        write_json(&out.join(SPEC), &spec)?;
+        tce_base::write_atomically(&out.join(CONFIG), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
         let training = Training { name: method.name, data, learner: &self.config.learner, arena, directory: out };
@@ -238,7 +270,7 @@ impl TrainingRun<'_> {
     /// Trains the baseline: an ensemble of clones of the target rows per seed, in `baseline/`.
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.baseline_learner();
-        let directory = self.out.join("baseline");
+        let directory = self.out.join(BASELINE_FOLDER);
         let training = Training { name: BASELINE, data, learner: &learner, arena: None, directory: &directory };
         let (files, _) = self.train(training, key, inputs, device)?;
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
@@ -249,11 +281,17 @@ impl TrainingRun<'_> {
     }
 
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
-        let evaluator = || OffPolicyEvaluator::train(inputs, &self.config.dynamics, self.out, device);
         // Without a simulator a single policy is tried, too: there is no other estimate of its return.
         let alone = self.own.env.and_then(|_| only(&candidates));
-        let fitted_q = (self.config.fitted_q.steps > 0).then_some((&self.config.fitted_q, device));
-        keep(alone.map_or_else(|| recommend(evaluator, &candidates, fitted_q), Ok)?, self.out)
+        let verdict = match alone.or_else(|| without_rewards(&candidates, inputs.target.complete())) {
+            Some(verdict) => verdict,
+            None => {
+                let evaluator = || OffPolicyEvaluator::train(inputs, &self.config.dynamics, self.out, device);
+                let fitted_q = (self.config.fitted_q.steps > 0).then_some((&self.config.fitted_q, device));
+                recommend(evaluator, &candidates, fitted_q)?
+            }
+        };
+        keep(verdict, self.out)
     }
 
     /// All inputs that decide the result. The source's rows decide the comparison alone.
@@ -280,12 +318,104 @@ impl TrainingRun<'_> {
                 let baseline = Config { learner: self.baseline_learner(), ..config.clone() };
                 course.training(BASELINE, &baseline, LearnedRows::Target);
             }
-            course.verdict(config);
-            let policies = if learned == LearnedRows::Mixed { 2 } else { 1 };
-            course.fitted_q(config, seeds * policies);
+            if only_reward(inputs.target.complete()).is_none() {
+                let policies = seeds * if learned == LearnedRows::Mixed { 2 } else { 1 };
+                course.verdict(config, policies);
+                course.fitted_q(config, policies);
+            }
         }
         course.plan();
     }
+
+    /// The finished training of `spec`, whose hash is `key`; None if something of it is missing or was changed.
+    ///
+    /// # Errors
+    /// If the directory holds results or checkpoints of another training.
+    fn found(&self, spec: &serde_json::Value, key: &str) -> Result<Option<Trained>> {
+        let out = self.out;
+        let summary = read_if_there(&out.join("summary.json"))?;
+        let trained = summary.as_deref().and_then(|bytes| serde_json::from_slice::<Trained>(bytes).ok());
+        let compared = trained.as_ref().is_some_and(|t| t.verdict.is_some());
+        let same = match read_if_there(&out.join(SPEC))? {
+            Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| {
+                // The source decides the comparison alone: policies that were not compared may be compared with any.
+                if compared && self.comparison == Comparison::Recommend {
+                    found == *spec
+                } else {
+                    without_source(&found) == without_source(spec)
+                }
+            }),
+            None => summary.is_none(),
+        };
+        if !same {
+            let end = if summary.is_some() { "the results of a" } else { "an interrupted" };
+            return Err(Error::Usage(format!(
+                "{}: found {end} training run with other settings, seeds or files; choose another --out{}",
+                out.display(),
+                if summary.is_some() { " (tce evaluate tries a policy that is there)" } else { ", or remove it" }
+            )));
+        }
+        let Some(mut trained) = trained.map(|t| t.with_paths(|path| out.join(path))) else { return Ok(None) };
+        // What is missing or was changed is made again, from what is still there.
+        let learned = Done::is_intact(out, key, self.seeds)?;
+        let kept = match &trained.verdict {
+            Some(kept) if learned => self.is_intact(kept, spec, key)?,
+            _ => false,
+        };
+        if !kept {
+            trained.verdict = None;
+        }
+        if !learned || compared && !kept {
+            tce_base::note!("{}: files of the finished training are missing or were changed", out.display());
+        }
+        Ok(Some(trained).filter(|_| learned && (kept || self.comparison == Comparison::Skip)))
+    }
+
+    /// Whether a verdict is there with all that it is about: the baseline, where the training `spec` has one, and the recommended policy,
+    /// which is a copy of one of the policies.
+    fn is_intact(&self, kept: &Kept, spec: &serde_json::Value, key: &str) -> Result<bool> {
+        let baseline = !spec["extra"].is_null();
+        if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), key, self.seeds)? {
+            return Ok(false);
+        }
+        let copied = match (read_if_there(&kept.file)?, read_if_there(&kept.verdict.policy)?) {
+            (Some(copy), Some(policy)) => copy == policy,
+            _ => false,
+        };
+        Ok(copied && self.out.join("verdict.json").exists())
+    }
+}
+
+/// The reward of all rows of `target`, where they have the same one and it tells nothing of a policy. One other than 0 counts the steps, which
+/// tells something where episodes end in terminals.
+fn only_reward(target: &Transitions) -> Option<f32> {
+    let first = *target.rewards.first()?;
+    let equal = target.rewards.iter().all(|&reward| reward == first);
+    (equal && (first == 0.0 || !target.terminals.contains(&true))).then_some(first)
+}
+
+/// The verdict where the rewards of `target` tell nothing: the baseline. A model of such rewards predicts noise around the one that there is,
+/// and that must not choose. None where they tell something.
+fn without_rewards(candidates: &[Candidate], target: &Transitions) -> Option<Verdict> {
+    let reward = only_reward(target)?;
+    if let Some(verdict) = only(candidates) {
+        let reason =
+            format!("{} The target's rewards are all equal ({reward}) and tell nothing of its return.", verdict.reason);
+        return Some(Verdict { reason, ..verdict });
+    }
+    let standard = candidates.iter().find(|c| c.baseline)?;
+    Some(Verdict {
+        method: standard.name.clone(),
+        policy: standard.files.first()?.clone(),
+        sure: false,
+        reason: format!(
+            "{} is recommended: the target's rewards are all equal ({reward}), so that nothing can be compared. Record rewards that \
+             tell good steps from bad ones to compare policies.",
+            standard.name
+        ),
+        tried: Vec::new(),
+        behaviour_value: None,
+    })
 }
 
 /// The inputs that decide the policies.
@@ -295,35 +425,36 @@ fn without_source(spec: &serde_json::Value) -> serde_json::Value {
     spec
 }
 
-/// The finished training of `spec` in `out`; None if something of it is missing.
-///
-/// # Errors
-/// If `out` holds results or checkpoints of another training.
-fn found(out: &Path, spec: &serde_json::Value, comparison: Comparison) -> Result<Option<Trained>> {
-    let summary = read_if_there(&out.join("summary.json"))?;
-    let trained = summary.as_deref().and_then(|bytes| serde_json::from_slice::<Trained>(bytes).ok());
-    let compared = trained.as_ref().is_some_and(|t| t.verdict.is_some());
-    let same = match read_if_there(&out.join("spec.json"))? {
-        Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| {
-            // The source decides the comparison alone: policies that were not compared may be compared with any.
-            if compared && comparison == Comparison::Recommend {
-                found == *spec
-            } else {
-                without_source(&found) == without_source(spec)
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equal_rewards_tell_nothing_unless_episodes_end() {
+        let told = |rewards: [f32; 3], terminal: bool| {
+            let mut t = Transitions::new(1, 1);
+            for (i, reward) in rewards.into_iter().enumerate() {
+                t.push(&[i as f32], &[0.0], reward, &[i as f32 + 1.0], terminal && i == 2, !terminal && i == 2);
             }
-        }),
-        None => summary.is_none(),
-    };
-    if !same {
-        let end = if summary.is_some() { "the results of a" } else { "an interrupted" };
-        return Err(Error::Usage(format!(
-            "{}: found {end} training run with other settings, seeds or files; choose another --out{}",
-            out.display(),
-            if summary.is_some() { " (tce evaluate tries a policy that is there)" } else { ", or remove it" }
-        )));
+            only_reward(&t)
+        };
+        assert_eq!(told([1.0, 1.0, 2.0], false), None);
+        // A reward for every step until the robot falls counts the steps.
+        assert_eq!((told([1.0; 3], true), told([1.0; 3], false)), (None, Some(1.0)));
+        assert_eq!((told([0.0; 3], true), told([0.0; 3], false)), (Some(0.0), Some(0.0)));
+
+        let candidate = |name: &str, baseline, seeds: u64| Candidate {
+            name: name.into(),
+            baseline,
+            files: (0..seeds).map(|seed| policy_file(seed).into()).collect(),
+        };
+        let mut t = Transitions::new(1, 1);
+        t.push(&[0.0], &[0.0], 0.0, &[1.0], true, false);
+        let two = without_rewards(&[candidate("clones", true, 2), candidate("wider", false, 2)], &t).unwrap();
+        assert_eq!((two.method.as_str(), two.sure, two.policy), ("clones", false, PathBuf::from(policy_file(0))));
+        let one = without_rewards(&[candidate("clones", true, 1)], &t).unwrap();
+        assert!(one.sure && one.reason.contains("rewards are all equal (0)"), "{}", one.reason);
+        t.rewards[0] = 1.0;
+        assert_eq!(without_rewards(&[candidate("clones", true, 1)], &t), None);
     }
-    let trained = trained.map(|t| t.with_paths(|path| out.join(path)));
-    // Policies that were removed are learned again.
-    let whole = |t: &Trained| t.policies.iter().all(|p| p.exists());
-    Ok(trained.filter(|t| whole(t) && (compared || comparison == Comparison::Skip)))
 }

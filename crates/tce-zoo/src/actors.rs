@@ -172,6 +172,13 @@ pub struct Evaluation {
     /// Why there are no episodes, if the evaluation failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failed: Option<String>,
+    /// Episodes that ended because the physics became unstable: their last rewards mean nothing.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub unstable: usize,
+}
+
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 impl Evaluation {
@@ -179,12 +186,13 @@ impl Evaluation {
         let returns: Vec<f64> = results.iter().map(|r| r.episode_return).collect();
         let mean_return = returns.iter().sum::<f64>() / returns.len() as f64;
         let score = reference.map(|r| r.normalised_score(mean_return));
-        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score, failed: None }
+        let unstable = results.iter().filter(|r| r.unstable).count();
+        Self { lengths: results.iter().map(|r| r.length).collect(), returns, score, failed: None, unstable }
     }
 
     /// The evaluation of a policy that cannot act, with the reason.
     pub fn failed(why: String) -> Self {
-        Self { returns: Vec::new(), lengths: Vec::new(), score: None, failed: Some(why) }
+        Self { returns: Vec::new(), lengths: Vec::new(), score: None, failed: Some(why), unstable: 0 }
     }
 
     /// Mean length of the episodes.

@@ -81,10 +81,32 @@ fn same_bits(a: &[f32], b: &[f32]) -> bool {
     a.chunks(16).zip(b.chunks(16)).all(|pair| differ(pair) == 0)
 }
 
-/// The number k of interleaved environments: s'ᵢ is the state of row i + k and not of row i + 1. The default is 1.
-pub(super) fn environments(table: &Table<'_>, tolerance: &[f32]) -> usize {
+/// In which row the state s'ᵢ is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Lag {
+    /// In row i + 1, or in no particular one.
+    Next,
+    /// In row i + k, because the rows of k environments take turns.
+    Turns(usize),
+    /// In row i + k of one robot, whose rows are in order: each row is k steps.
+    Later(usize),
+}
+
+impl Lag {
+    /// The number of environments that take turns.
+    pub fn environments(self) -> usize {
+        match self {
+            Self::Turns(environments) => environments,
+            Self::Next | Self::Later(_) => 1,
+        }
+    }
+}
+
+/// Finds the row of most successors. Rows that take turns and rows of several steps each look the same to s'; the
+/// distances between neighbours tell them apart, and so do the marks.
+pub(super) fn lag(table: &Table<'_>, tolerance: &[f32]) -> Lag {
     let n = table.terminals.len();
-    let Some(next) = table.next_observations else { return 1 };
+    let Some(next) = table.next_observations else { return Lag::Next };
     let continuity = Continuity { table, next, tolerance };
     let sample: Vec<usize> = (0..n).step_by(n.div_ceil(2000)).collect();
     let share = |lag: usize| {
@@ -92,10 +114,25 @@ pub(super) fn environments(table: &Table<'_>, tolerance: &[f32]) -> usize {
         rows.iter().filter(|&&&i| continuity.joined(i, lag)).count() as f64 / rows.len().max(1) as f64
     };
     if share(1) > 0.5 {
-        return 1;
+        return Lag::Next;
     }
-    let lags = 2..=MOST_ENVIRONMENTS.min(n / 2);
-    lags.into_iter().find(|&lag| share(lag) > 0.5).unwrap_or(1)
+    let mut lags = 2..=MOST_ENVIRONMENTS.min(n / 2);
+    match lags.find(|&lag| share(lag) > 0.5) {
+        None => Lag::Next,
+        Some(lag) if Steps::new(table).nearer_than(lag) || marked_as_one(&continuity, lag) => Lag::Later(lag),
+        Some(lag) => Lag::Turns(lag),
+    }
+}
+
+/// Whether the marks are those of one robot: at the end of an episode, its last `lag` rows have no successor `lag` rows
+/// further on, and only the last of them is marked. Where environments take turns, the row before a marked one is
+/// another environment's, which goes on or has a mark of its own.
+fn marked_as_one(continuity: &Continuity<'_>, lag: usize) -> bool {
+    let table = continuity.table;
+    let marked = |i: usize| table.terminals[i] || table.timeouts.is_some_and(|timeouts| timeouts[i]);
+    let broken = |i: usize| !continuity.joined(i, lag);
+    let ends: Vec<usize> = (1..table.terminals.len() - lag).filter(|&i| marked(i) && broken(i)).collect();
+    2 * ends.iter().filter(|&&i| broken(i - 1) && !marked(i - 1)).count() > ends.len()
 }
 
 /// The indices of `n` interleaved rows, sorted by environment.
@@ -126,11 +163,14 @@ pub fn continued(t: &Transitions) -> Vec<bool> {
 }
 
 /// Decides where episodes end and which successors are known. The rows must be in order.
-pub(super) fn resolve(table: &Table<'_>, tolerance: &[f32], environments: usize) -> Resolved {
+pub(super) fn resolve(table: &Table<'_>, tolerance: &[f32], lag: Lag) -> Resolved {
+    if let Lag::Later(steps) = lag {
+        return some_steps_later(table, steps);
+    }
     match (table.next_observations, table.timeouts) {
         (Some(next), timeouts) => {
             let mut joined = Continuity { table, next, tolerance }.all();
-            cut_between(&mut joined, environments);
+            cut_between(&mut joined, lag.environments());
             match timeouts {
                 Some(timeouts) => by_marks(table, timeouts, &joined),
                 None => by_continuity(table, &joined),
@@ -278,6 +318,20 @@ fn elsewhere(breaks: usize, n: usize) -> String {
         "the stored next_observations are not the next row's state in {breaks} of {n} rows, although the rows are in order (other digits, other \
          columns, or some steps later?): they are used as they are, and episodes end where the file marks it"
     )
+}
+
+/// Handles rows in order whose stored successors are the state `steps` rows later.
+fn some_steps_later(table: &Table<'_>, steps: usize) -> Resolved {
+    let (timeouts, ends) = match table.timeouts {
+        Some(timeouts) => (timeouts.to_vec(), EpisodeEnds::Marks),
+        None => (vec![false; table.terminals.len()], EpisodeEnds::Terminals),
+    };
+    let mut out = Resolved::new(timeouts, Successors::Stored, ends);
+    out.warnings.push(format!(
+        "the stored next_observations are the state {steps} rows later, although the rows are in order (is each row {steps} steps?): they are \
+         used as they are, and episodes end where the file marks it"
+    ));
+    out
 }
 
 /// Handles a file whose stored successors are the next row's state even at ends, where the true ones are unknown.

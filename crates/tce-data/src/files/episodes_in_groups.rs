@@ -7,6 +7,7 @@ use super::formats::{Columns, Raw};
 use super::hdf5::{Column, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
+use super::rounding::told_losses;
 use crate::{DataError, Problem};
 
 /// The groups `PREFIX0`, `PREFIX1`, ... in `parent`, in the order of their numbers.
@@ -28,6 +29,8 @@ pub(super) struct Field {
     pub parts: Vec<(String, usize)>,
     /// `[rows, dim]`.
     pub data: Vec<f32>,
+    /// Of each column, what the rounding lost: see [`losses`](super::rounding::losses).
+    pub losses: Vec<f32>,
     /// Members that are not columns of numbers (images, text).
     pub left_out: Vec<String>,
 }
@@ -84,7 +87,8 @@ pub(super) fn field(file: &Hdf5, path: &str) -> Result<Field, DataError> {
     for i in 0..rows {
         columns.iter().for_each(|(_, c)| data.extend_from_slice(&c.data[i * c.dim..(i + 1) * c.dim]));
     }
-    Ok(Field { rows, parts, data, left_out })
+    let losses = columns.into_iter().flat_map(|(_, c)| c.losses).collect();
+    Ok(Field { rows, parts, data, losses, left_out })
 }
 
 fn gather(
@@ -137,6 +141,8 @@ pub(super) fn unless_empty(field: Result<Field, DataError>, empty: &mut usize) -
 pub(super) struct Together {
     pub obs: Vec<(String, usize)>,
     pub act: Vec<(String, usize)>,
+    /// The largest losses of the columns of states and of actions, over the episodes.
+    losses: [Vec<f32>; 2],
     pub observations: Vec<f32>,
     pub next_observations: Vec<f32>,
     pub actions: Vec<f32>,
@@ -147,8 +153,14 @@ pub(super) struct Together {
 }
 
 impl Together {
-    /// Adds the warning about what was left out.
+    /// Adds the warnings about what was left out, and about what was rounded too much.
     pub fn finish(&mut self, empty: usize, options: &LoadOptions) {
+        let [states, actions] = &self.losses;
+        let told = [
+            told_losses("observations", states, &self.observations, states.len()),
+            told_losses("actions", actions, &self.actions, actions.len()),
+        ];
+        self.warnings.extend(told.into_iter().flatten());
         if empty > 0 {
             self.warnings.push(format!("{empty} episodes without a step were left out"));
         }
@@ -176,7 +188,8 @@ impl Together {
         Raw { layout, columns, known: None, warnings: self.warnings }
     }
 
-    /// Records the columns of states and actions; returns an error if they differ from those of earlier episodes.
+    /// Records the columns of states and actions, and their losses; returns an error if they differ from those of
+    /// earlier episodes.
     pub fn same(&mut self, file: &Hdf5, episode: &str, states: &Field, actions: &Field) -> Result<(), DataError> {
         if self.obs.is_empty() {
             (self.obs, self.act) = (states.parts.clone(), actions.parts.clone());
@@ -200,6 +213,10 @@ impl Together {
                 expected,
                 "Write episodes of one robot into one file",
             ));
+        }
+        for (largest, field) in self.losses.iter_mut().zip([states, actions]) {
+            largest.resize(field.losses.len(), 0.0);
+            largest.iter_mut().zip(&field.losses).for_each(|(largest, loss)| *largest = largest.max(*loss));
         }
         Ok(())
     }

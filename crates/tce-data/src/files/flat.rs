@@ -12,9 +12,10 @@
 use std::collections::BTreeMap;
 
 use super::formats::{Columns, Format, Raw};
-use super::hdf5::{Column, Hdf5};
+use super::hdf5::{Beside, Column, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
+use super::rounding::told_losses;
 use super::successors::{fill_gaps, layout_of, told_gaps};
 use super::{FORMAT, FORMAT_ATTRIBUTE, KNOWN};
 use crate::{DataError, Problem};
@@ -79,37 +80,32 @@ impl Format for Flat {
         });
         let observed = observed.expect("the scope has run")?;
         let mut stored = stored.transpose()?;
-        let (acted, rewarded) = (file.matrix(actions)?, file.vector(rewards)?);
-        let terminal = file.flags(terminals)?;
-        let timeout = timeouts.map(|name| file.flags(name)).transpose()?;
-        let known = if file.has(KNOWN) { Some(file.flags(KNOWN)?) } else { None };
+        let beside = Beside { field: observations, rows: observed.rows };
+        let (acted, rewarded) = (file.matrix(actions)?, file.vector(rewards, beside)?);
+        let terminal = file.flags(terminals, beside)?;
+        let timeout = timeouts.map(|name| file.flags(name, beside)).transpose()?;
+        let mut known = if file.has(KNOWN) { Some(file.flags(KNOWN, beside)?) } else { None };
         let columns = further(
             file,
             options,
             &[observations, actions, rewards, terminals],
             next,
             timeouts,
-            observed.rows,
+            beside,
             &mut warnings,
         )?;
 
-        let rows = observed.rows;
         let mut counts = vec![(actions, acted.rows), (rewards, rewarded.rows), (terminals, terminal.len())];
         counts.extend(next.zip(stored.as_ref()).map(|(name, c)| (name, c.rows)));
         counts.extend(timeouts.zip(timeout.as_ref()).map(|(name, t)| (name, t.len())));
         counts.extend(known.as_ref().map(|k| (KNOWN, k.len())));
         counts.extend(columns.iter().map(|(k, v)| (k.as_str(), v.len())));
-        if let Some((name, n)) = counts.iter().find(|c| c.1 != rows) {
-            let expected = format!("{rows} rows, as in `{observations}`");
-            let advice = "The fields must have one row per transition: write the file again";
-            return Err(file.invalid(Problem::RowCount, name, format!("{n} rows"), expected, advice));
-        }
+        same_rows(file, beside, &counts)?;
         if let Some((name, c)) = next.zip(stored.as_ref()).filter(|(_, c)| c.dim != observed.dim) {
             let advice = "A state and its successor have the same dimension: write the file again";
             let expected = format!("{} columns, as in `{observations}`", observed.dim);
             return Err(file.invalid(Problem::Dimension, name, format!("{} columns", c.dim), expected, advice));
         }
-        let mut known = known;
         if let Some((name, c)) = next.zip(stored.as_mut()) {
             match fill_gaps(&mut c.data, &observed.data, &terminal, &mut known) {
                 // The plain read returns an error that says where and what.
@@ -119,6 +115,9 @@ impl Format for Flat {
         }
         if observed.rounded || stored.as_ref().is_some_and(|c| c.rounded) {
             warnings.push("states are stored as float64; they were rounded to float32".to_owned());
+        }
+        for (name, c) in [(observations, &observed), (actions, &acted), (rewards, &rewarded)] {
+            warnings.extend(told_losses(name, &c.losses, &c.data, c.dim));
         }
         let trusted = file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT);
         let layout = match (trusted, &stored, &timeout) {
@@ -140,27 +139,38 @@ impl Format for Flat {
     }
 }
 
-/// The requested columns. If all are requested: all columns of the file, and a warning about unreadable ones.
+/// Returns an error if one of these fields, with its number of rows, has more or fewer of them than `beside`.
+fn same_rows(file: &Hdf5, beside: Beside<'_>, counts: &[(&str, usize)]) -> Result<(), DataError> {
+    let Some((name, n)) = counts.iter().find(|c| c.1 != beside.rows) else { return Ok(()) };
+    let expected = format!("{} rows, as in `{}`", beside.rows, beside.field);
+    let advice = "The fields must have one row per transition: write the file again";
+    Err(file.invalid(Problem::RowCount, name, format!("{n} rows"), expected, advice))
+}
+
+/// The requested columns. If all are requested: all columns of the file, and warnings about unreadable ones.
 fn further(
     file: &Hdf5,
     options: &LoadOptions,
     fields: &[&str],
     next: Option<&str>,
     timeouts: Option<&str>,
-    rows: usize,
+    beside: Beside<'_>,
     warnings: &mut Vec<String>,
 ) -> Result<BTreeMap<String, Vec<f32>>, DataError> {
     let mut columns = BTreeMap::new();
     for name in &options.columns {
-        columns.insert(name.clone(), file.vector(name)?.data);
+        columns.insert(name.clone(), file.vector(name, beside)?.data);
     }
     if options.all_columns {
         let read = |name: &str| fields.contains(&name) || next == Some(name) || timeouts == Some(name) || name == KNOWN;
-        let mut left_out = Vec::new();
+        let (rows, mut left_out) = (beside.rows, Vec::new());
         for name in file.all_datasets()?.into_iter().filter(|name| !read(name)) {
-            match file.vector(&name) {
+            match file.vector(&name, beside) {
                 Ok(column) if column.rows == rows && name.matches('/').count() <= 1 => {
                     drop(columns.insert(name, column.data))
+                }
+                Err(DataError::Invalid { problem: Problem::NonFinite, found, expected, .. }) => {
+                    warnings.push(format!("`{name}` was not read: found {found}; expected {expected}"));
                 }
                 _ => left_out.push(name),
             }

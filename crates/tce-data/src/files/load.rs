@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::episodes;
+use super::episodes::{self, Lag};
 use super::flat::Flat;
 use super::formats::{Format, Raw};
 use super::hdf5::Hdf5;
@@ -156,8 +156,8 @@ fn settle(
 ) -> Summary {
     let rows = t.len();
     let mut tolerance = episodes::tolerance(&Table::of(t, limit));
-    let environments = episodes::environments(&Table::of(t, limit), &tolerance);
-    if environments > 1 {
+    let lag = episodes::lag(&Table::of(t, limit), &tolerance);
+    if let Lag::Turns(environments) = lag {
         warnings.push(format!(
             "the rows of {environments} environments take turns (s' is the state {environments} rows later): they were put one environment \
              after the other"
@@ -166,7 +166,7 @@ fn settle(
         // Once the rows are in order, the distances between them have changed.
         tolerance = episodes::tolerance(&Table::of(t, limit));
     }
-    let mut out = episodes::resolve(&Table::of(t, limit), &tolerance, environments);
+    let mut out = episodes::resolve(&Table::of(t, limit), &tolerance, lag);
     // Successors that the file marks as unknown stay unknown.
     out.known.iter_mut().zip(&t.known).for_each(|(known, said)| *known &= said);
     warnings.extend(out.warnings);
@@ -180,7 +180,7 @@ fn settle(
     }
     (t.timeouts, t.known) = (out.timeouts, out.known);
     retain(t, columns, &out.keep);
-    Summary { environments, ends: out.ends, successors: out.successors, dropped: out.dropped }
+    Summary { environments: lag.environments(), ends: out.ends, successors: out.successors, dropped: out.dropped }
 }
 
 fn reorder(t: &mut Transitions, columns: &mut BTreeMap<String, Vec<f32>>, order: &[usize]) {

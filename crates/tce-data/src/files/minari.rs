@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use super::episodes_in_groups::{Together, field, numbered, unless_empty};
 use super::formats::{Format, Raw};
-use super::hdf5::Hdf5;
+use super::hdf5::{Beside, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
 use crate::{DataError, Problem};
@@ -35,8 +35,10 @@ impl Format for Minari {
             let at = |name: &str| format!("{episode}/{name}");
             let Some(actions) = unless_empty(field(file, &at("actions")), &mut empty)? else { continue };
             let states = field(file, &at("observations"))?;
-            let rewards = file.vector(&at("rewards"))?;
-            let (terminations, truncations) = (file.flags(&at("terminations"))?, file.flags(&at("truncations"))?);
+            let beside = Beside { field: &at("actions"), rows: actions.rows };
+            let rewards = file.vector(&at("rewards"), beside)?;
+            let flags = |name: &str| file.flags(&at(name), beside);
+            let (terminations, truncations) = (flags("terminations")?, flags("truncations")?);
             all.same(file, &episode, &states, &actions)?;
             let (n, d) = (actions.rows, states.dim());
             for (name, rows, expected) in [

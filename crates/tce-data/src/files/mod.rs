@@ -24,6 +24,7 @@ mod minari;
 mod options;
 mod report;
 mod robomimic;
+mod rounding;
 mod rows;
 mod save;
 mod save_minari;

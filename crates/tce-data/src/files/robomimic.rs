@@ -6,7 +6,7 @@
 
 use super::episodes_in_groups::{Together, field, numbered, unless_empty};
 use super::formats::{Format, Raw};
-use super::hdf5::Hdf5;
+use super::hdf5::{Beside, Hdf5};
 use super::options::LoadOptions;
 use super::report::Layout;
 use crate::{DataError, Problem};
@@ -31,8 +31,9 @@ impl Format for Robomimic {
             let has = |name: &str| members.iter().any(|m| m == name);
             let next = if has("next_obs") { Some(field(file, &at("next_obs"))?) } else { None };
             let n = actions.rows;
-            let rewards = if has("rewards") { file.vector(&at("rewards"))?.data } else { vec![0.0; n] };
-            let dones = if has("dones") { file.flags(&at("dones"))? } else { vec![false; n] };
+            let beside = Beside { field: &at("actions"), rows: n };
+            let rewards = if has("rewards") { file.vector(&at("rewards"), beside)?.data } else { vec![0.0; n] };
+            let dones = if has("dones") { file.flags(&at("dones"), beside)? } else { vec![false; n] };
             all.same(file, &demo, &states, &actions)?;
             let mut counts = vec![("obs", states.rows), ("rewards", rewards.len()), ("dones", dones.len())];
             counts.extend(next.as_ref().map(|f| ("next_obs", f.rows)));

@@ -2,13 +2,18 @@
 
 /// Lists rows in words: `row 3`, `rows 3, 7 and 11`, `rows 99, 199, 299 and 16 more`.
 pub(super) fn tell(rows: &[usize]) -> String {
-    match rows {
-        [] => "no row".into(),
-        [one] => format!("row {one}"),
-        [a, b, c, _, _, ..] => format!("rows {a}, {b}, {c} and {} more", rows.len() - 3),
+    listed("row", rows)
+}
+
+/// Lists numbered things, of which one is a `noun`, as [`tell`] lists rows.
+pub(super) fn listed(noun: &str, numbers: &[usize]) -> String {
+    match numbers {
+        [] => format!("no {noun}"),
+        [one] => format!("{noun} {one}"),
+        [a, b, c, _, _, ..] => format!("{noun}s {a}, {b}, {c} and {} more", numbers.len() - 3),
         [start @ .., last] => {
             let start: Vec<_> = start.iter().map(usize::to_string).collect();
-            format!("rows {} and {last}", start.join(", "))
+            format!("{noun}s {} and {last}", start.join(", "))
         }
     }
 }
@@ -58,5 +63,6 @@ mod tests {
         let expected =
             ["no row", "row 10", "rows 10, 11 and 12", "rows 10, 11, 12 and 13", "rows 10, 11, 12 and 2 more"];
         assert_eq!(told, expected);
+        assert_eq!(listed("column", &[1, 2]), "columns 1 and 2");
     }
 }

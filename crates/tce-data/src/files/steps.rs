@@ -12,7 +12,7 @@ pub(super) struct Steps<'a> {
 
 impl<'a> Steps<'a> {
     pub fn new(table: &'a Table<'a>) -> Self {
-        let lengths = step_lengths(table.observations, table.dim);
+        let lengths = step_lengths(table.observations, table.dim, 1);
         let median = median(lengths.iter().copied());
         Self { table, lengths, median }
     }
@@ -33,8 +33,13 @@ impl<'a> Steps<'a> {
         let far = (n as f64 * 0.381_966) as usize;
         let rows: Vec<f32> =
             (0..n).flat_map(|i| self.table.observations[((i + i * far) % n) * d..][..d].iter().copied()).collect();
-        let apart = median(step_lengths(&rows, d).into_iter());
+        let apart = median(step_lengths(&rows, d, 1).into_iter());
         self.median < 0.6 * apart
+    }
+
+    /// Whether a row is closer to the next one than to the row `lag` further on, as the rows of one robot are.
+    pub fn nearer_than(&self, lag: usize) -> bool {
+        self.median < median(step_lengths(self.table.observations, self.table.dim, lag).into_iter())
     }
 }
 
@@ -118,11 +123,11 @@ fn jumps(lengths: &[f32], ended: &dyn Fn(usize) -> bool) -> Vec<usize> {
     if rows.len() >= 3 { rows } else { Vec::new() }
 }
 
-/// The length of the step from each row to the next, in units of the columns' spreads.
-fn step_lengths(observations: &[f32], dim: usize) -> Vec<f32> {
+/// The distance from each row to the row `lag` further on, in units of the columns' spreads.
+fn step_lengths(observations: &[f32], dim: usize, lag: usize) -> Vec<f32> {
     let moments = crate::moments::Moments::of(&[crate::Rows::new(observations, dim)]);
     let scale: Vec<f32> = moments.std.iter().map(|&s| if s > 0.0 { 1.0 / s as f32 } else { 0.0 }).collect();
-    let pairs = observations.chunks_exact(dim).zip(observations.chunks_exact(dim).skip(1));
+    let pairs = observations.chunks_exact(dim).zip(observations.chunks_exact(dim).skip(lag));
     let length = |(a, b): (&[f32], &[f32])| {
         a.iter().zip(b).zip(&scale).map(|((a, b), s)| ((b - a) * s).powi(2)).sum::<f32>().sqrt()
     };

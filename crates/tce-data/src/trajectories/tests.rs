@@ -59,6 +59,38 @@ fn falls_tell_where_the_pace_does_not() {
     assert!(!choose_trajectories(&t).is_selective());
 }
 
+/// The paces of equal trajectories differ by chance. Falls that are too short for a pace must not make that a split.
+#[test]
+fn falls_do_not_divide_equal_trajectories() {
+    for (long, falls, rows) in [(4, 40, 15), (10, 100, 20), (10, 100, 300), (3, 30, 240)] {
+        let mut trajectories = vec![(1000, 1.0, Limit); long];
+        trajectories.extend(vec![(rows, 1.0, Fall); falls]);
+        let t = data(&trajectories, 10);
+        let c = choose_trajectories(&t);
+        assert_eq!(kept(&c, &t), (0..long).collect::<Vec<_>>(), "{}", c.reason);
+        assert!(matches!(c.threshold, Some((Measure::Return, _))), "{}", c.reason);
+    }
+}
+
+/// Three even trajectories and three with an outburst return as much, at another pace: the falls beside them are what
+/// lowers the mean return of the slower group.
+#[test]
+fn falls_do_not_make_the_difference_between_equal_returns() {
+    for falls in [0, 1, 40] {
+        let mut trajectories = vec![(1000, 1.0, Limit); 6];
+        trajectories.extend(vec![(15, 1.0, Fall); falls]);
+        let mut t = data(&trajectories, 11);
+        for (i, reward) in t.rewards[..6000].iter_mut().enumerate() {
+            let outburst = (400..600).contains(&(i % 1000));
+            *reward = if i < 3000 { 1.0 } else { 0.79 + f32::from(u8::from(outburst)) };
+        }
+        let c = choose_trajectories(&t);
+        // A single fall is an accident; many are a behaviour.
+        let all = if falls == 1 { 7 } else { 6 };
+        assert_eq!(kept(&c, &t), (0..all).collect::<Vec<_>>(), "{}", c.reason);
+    }
+}
+
 #[test]
 fn a_cut_trajectory_is_ranked_by_its_age() {
     for (reward, keep) in [(1.0, false), (3.0, true)] {

@@ -300,6 +300,61 @@ fn environments_that_take_turns_are_put_in_order() {
     }
 }
 
+/// The marks of several episodes fit the environments: each has its own.
+#[test]
+fn environments_with_several_episodes_are_put_in_order() {
+    let order: Vec<usize> = (0..ROWS / 4).flat_map(|i| (0..4).map(move |k| k * ROWS / 4 + i)).collect();
+    let got = Walks::new().permuted(&order).read();
+    assert_eq!((got.report.environments, spans(&got.transitions)), (4, right()));
+    assert_eq!(got.transitions.observations, Walks::new().observations);
+}
+
+/// Each row is several steps of one robot, as for n-step returns: s' is some rows later, and the rows stay where they
+/// are.
+#[test]
+fn rows_of_several_steps_are_not_several_environments() {
+    for steps in [2, 5, 20] {
+        let walks = Walks::new();
+        let after = |i: usize| {
+            let end = (i / LENGTH + 1) * LENGTH;
+            let last = walks.next.as_ref().unwrap();
+            let (rows, at) = if i + steps < end { (&walks.observations, i + steps) } else { (last, end - 1) };
+            rows[3 * at..3 * at + 3].to_vec()
+        };
+        let next: Vec<f32> = (0..ROWS).flat_map(after).collect();
+        let one = std::iter::once(0..ROWS).collect();
+        for (timeouts, episodes, ends) in
+            [(walks.timeouts.clone(), right(), EpisodeEnds::Marks), (None, one, EpisodeEnds::Terminals)]
+        {
+            let got = Walks { next: Some(next.clone()), timeouts, ..walks.clone() }.read();
+            assert_eq!((got.report.environments, got.report.episodes), (1, ends), "{steps}: {}", got.report);
+            assert_eq!((spans(&got.transitions), got.report.rows_kept), (episodes, ROWS), "{steps}: {}", got.report);
+            assert_eq!(
+                (&got.transitions.observations, &got.transitions.next_observations),
+                (&walks.observations, &next)
+            );
+            let told = format!("the state {steps} rows later, although the rows are in order");
+            assert!(got.report.to_string().contains(&told), "{}", got.report);
+        }
+    }
+}
+
+/// With a gait of five steps, a robot is closer to where it is five rows later than to the next row. An episode whose
+/// last five rows have no successor, and one mark, is that of one robot.
+#[test]
+fn the_marks_of_one_robot_are_not_those_of_several() {
+    let state = |row: usize, later: usize| {
+        let (episode, step) = ((row / LENGTH) as f64, (row % LENGTH + later) as f64);
+        let phase = step * (std::f64::consts::TAU / 5.0 + 0.002) + 1.3 * episode;
+        [phase.cos() as f32, phase.sin() as f32, 0.0]
+    };
+    let observations = (0..ROWS).flat_map(|i| state(i, 0)).collect();
+    let next = Some((0..ROWS).flat_map(|i| state(i, 5)).collect());
+    let got = Walks { observations, next, ..Walks::new() }.read();
+    assert_eq!((got.report.environments, spans(&got.transitions)), (1, right()), "{}", got.report);
+    assert!(got.report.to_string().contains("the state 5 rows later"), "{}", got.report);
+}
+
 #[test]
 fn rows_in_no_order_are_single_transitions_and_the_user_is_told() {
     let mut order: Vec<usize> = (0..ROWS).collect();

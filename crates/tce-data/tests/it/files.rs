@@ -174,6 +174,32 @@ fn every_storage_type_gives_the_same_rows() {
     assert_eq!(load(&write(&dir, "4.hdf5", b)).unwrap().transitions, want);
 }
 
+/// A coordinate in metres from a far origin: float32 holds half metres there, and the steps are centimetres. The same
+/// coordinate in whole metres loses nothing.
+#[test]
+fn doubles_that_lose_their_steps_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let read = |step: f64| {
+        let state = |i: u32| [f64::from(i).sin(), 5.4e6 + step * f64::from(i)];
+        let mut b = hdf5_pure::FileBuilder::new();
+        for (name, later) in [("observations", 0), ("next_observations", 1)] {
+            let states: Vec<f64> = (0..200).flat_map(|i| state(i + later)).collect();
+            b.create_dataset(name).with_f64_data(&states).with_shape(&[200, 2]);
+        }
+        b.create_dataset("actions").with_f64_data(&[0.5; 200]).with_shape(&[200, 1]);
+        b.create_dataset("rewards").with_f64_data(&[1.0; 200]);
+        crate::common::enum_flags(&mut b, "terminals", &[false; 200]);
+        load(&write(&dir, "far.hdf5", b)).unwrap().report.warnings.join("\n")
+    };
+    let told = read(0.01);
+    assert!(told.contains("`observations`: float32 rounds column 1 by more than 1 % of a usual step"), "{told}");
+    assert!(
+        told.contains("subtract an offset") && !told.contains("`actions`") && !told.contains("`rewards`"),
+        "{told}"
+    );
+    assert!(!read(1.0).contains("of a usual step"));
+}
+
 #[test]
 fn own_files_come_back_exactly_with_attributes_and_columns() {
     let dir = tempfile::tempdir().unwrap();

@@ -126,6 +126,38 @@ assert all(len(x.observations) == len(x.actions) + 1 for x in e) and all(s.obser
     assert!((sums[0] - sum(&t.observations) - ends).abs() < 1e-4 && (sums[1] - sum(&t.actions)).abs() < 1e-4);
 }
 
+/// Minari has one state between two rows: an episode is cut where that would replace a successor.
+#[test]
+fn successors_that_are_not_the_next_row_survive_in_minaris_layout() {
+    let dir = tempfile::tempdir().unwrap();
+    let written = |name: &str, t: &Transitions| {
+        save_minari(&dir.path().join(name), "tce/set-v0", t, None).unwrap();
+        load(&dir.path().join(name), &LoadOptions::default()).unwrap().transitions
+    };
+    // Successors that have nothing to do with the next row.
+    let mut t = synthetic(300, 4, 2, 50);
+    let back = written("apart", &t);
+    assert_eq!(
+        (&back.next_observations, &back.rewards, &back.terminals),
+        (&t.next_observations, &t.rewards, &t.terminals)
+    );
+    assert_eq!(back.episodes().len(), 300);
+    // One such row in an episode, and a terminal row whose successor is not known.
+    for i in (0..299).filter(|i| i % 50 != 49) {
+        let next = t.observation(i + 1).to_vec();
+        t.next_observations[4 * i..4 * i + 4].copy_from_slice(&next);
+    }
+    t.next_observations[4 * 20..4 * 21].fill(9.0);
+    let own = t.observation(149).to_vec();
+    t.next_observations[4 * 149..4 * 150].copy_from_slice(&own);
+    t.known[149] = false;
+    let back = written("one", &t);
+    let spans: Vec<_> = back.episodes().iter().map(|e| (e.start, e.end)).collect();
+    assert_eq!(spans, [(0, 21), (21, 50), (50, 100), (100, 150), (150, 200), (200, 250), (250, 300)]);
+    assert_eq!(back.next_observations, t.next_observations);
+    assert!(back.timeouts[20] && !back.terminals[20] && back.terminals[149] && back.known[149]);
+}
+
 /// A file in robomimic's layout, as in its documentation: `demos` demonstrations of 4 steps.
 fn robomimic(demos: usize, with_next: bool, dones: bool) -> FileBuilder {
     let mut b = FileBuilder::new();
@@ -225,6 +257,57 @@ fn episodes_without_a_step_are_left_out() {
     let got = load(&write(&dir, "empty.hdf5", b), &LoadOptions::default()).unwrap();
     assert_eq!((got.report.rows_kept, got.transitions.episodes().len()), (6, 2));
     assert!(got.report.to_string().contains("1 episodes without a step were left out"), "{}", got.report);
+}
+
+/// Groups in groups, in many episodes: every number comes from its own one. A clock far from zero is told once.
+#[test]
+fn columns_in_groups_of_groups_are_those_of_their_episode() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut b = FileBuilder::new();
+    for k in 0..30 {
+        let mut e = b.create_group(&format!("episode_{k}"));
+        let mut seen = e.create_group("observations");
+        let clock: Vec<f64> = (0..21).map(|i| 1.7e9 + 0.001 * f64::from(20 * k + i)).collect();
+        seen.create_dataset("clock").with_f64_data(&clock);
+        let mut tool = seen.create_group("tool");
+        let angle: Vec<f32> = (0..21).map(|i| (100 * k + i) as f32).collect();
+        tool.create_dataset("angle").with_f32_data(&angle);
+        seen.add_group(tool.finish());
+        e.add_group(seen.finish());
+        e.create_dataset("actions").with_f32_data(&[k as f32; 20]).with_shape(&[20, 1]);
+        e.create_dataset("rewards").with_f32_data(&[-k as f32; 20]);
+        for flags in ["terminations", "truncations"] {
+            e.create_dataset(flags).with_u8_data(&[0; 20]);
+        }
+        b.add_group(e.finish());
+    }
+    let got = load(&write(&dir, "nested.hdf5", b), &LoadOptions::default()).unwrap();
+    let t = &got.transitions;
+    assert_eq!((t.len(), t.obs_dim, t.episodes().len()), (600, 2, 30));
+    for i in 0..600 {
+        let (k, step) = ((i / 20) as f32, (i % 20) as f32);
+        assert_eq!((t.observation(i)[1], t.next_observation(i)[1]), (100.0 * k + step, 100.0 * k + step + 1.0));
+        assert_eq!((t.action(i), t.rewards[i]), (&[k][..], -k));
+    }
+    let told = got.report.to_string();
+    assert_eq!(told.matches("`observations`: float32 rounds column 0 by more than 1 %").count(), 1, "{told}");
+}
+
+/// A column that holds an infinity has the right shape: the reason is told as it is.
+#[test]
+fn a_column_that_is_not_finite_is_named_with_its_reason() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut b = crate::common::rows(40).d4rl();
+    let mut logp = [0.0; 40];
+    logp[3] = f32::NEG_INFINITY;
+    b.create_dataset("logp").with_f32_data(&logp);
+    b.create_dataset("short").with_f32_data(&[0.0; 39]);
+    let options = LoadOptions { all_columns: true, ..LoadOptions::default() };
+    let got = load(&write(&dir, "infinite.hdf5", b), &options).unwrap();
+    let told = got.report.to_string();
+    assert!(told.contains("`logp` was not read: found -inf in row 3, column 0 (1 such values)"), "{told}");
+    assert!(told.contains("no columns of 40 numbers: short"), "{told}");
+    assert!(got.columns.is_empty());
 }
 
 /// Fields under other names, and flags that do not say enough.

@@ -8,7 +8,7 @@ use rand::RngExt;
 use tce_base::Streams;
 use tce_data::{
     DensityOptions, LoadOptions, NeighbourOptions, Rows, Standardizer, TransportOptions, check, density_scores,
-    inspect, load, nn_distances, save_d4rl, transport_costs, zscore_keep,
+    inspect, load, nn_distances, save_d4rl, save_minari, transport_costs, zscore_keep,
 };
 
 fn seconds<T>(what: &str, work: impl FnOnce() -> T) -> T {
@@ -44,6 +44,18 @@ fn speed_of_files() {
     seconds("check", || check(&t, None));
     seconds("standardise", || Standardizer::fit(&t.observations, 17).apply(&t.observations));
     seconds("z-score", || zscore_keep(&Rows::state_pairs(&t), 3.0));
+}
+
+#[test]
+#[ignore = "a timing"]
+fn speed_of_many_episodes() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("tce/many-v0");
+    // No successor is the next row's state: every row becomes an episode.
+    let t = crate::common::synthetic(8000, 3, 2, 10);
+    seconds("save 8000 episodes", || save_minari(&path, "tce/many-v0", &t, None).unwrap());
+    let got = seconds("load", || load(&path, &LoadOptions::default()).unwrap());
+    assert!(got.transitions.rewards == t.rewards);
 }
 
 #[test]

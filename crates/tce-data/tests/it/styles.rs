@@ -185,6 +185,45 @@ for libver in ["earliest", "latest"]:
     }
 }
 
+/// Flags that were never written have as many rows as the states or actions beside them, whatever those are called.
+#[test]
+fn unwritten_flags_beside_fields_of_other_names() {
+    let dir = tempfile::tempdir().unwrap();
+    let script = r#"
+actions = FIELDS["actions"]
+for name, rows in [("alias", n), ("longer", n + 1)]:
+    f = open_file(name)
+    for k, v in dict(obs=state, action=actions, reward=i, next_obs=after, truncated=ends).items():
+        f[k] = v
+    f.create_dataset("terminated", (rows,), bool)
+f = open_file("minari")
+for e in range(3):
+    g = f.create_group(f"episode_{e}")
+    g["observations"], g["actions"], g["rewards"], g["truncations"] = state[:11], actions[:10], i[:10], ends[:10]
+    g.create_dataset("terminations", (10,), bool)
+f = open_file("robomimic")
+g = f.create_group("data/demo_0")
+g["obs/q"], g["next_obs/q"], g["actions"] = state, after, actions
+g.create_dataset("dones", (n,), "i8")
+"#;
+    if python(&format!("{PREPARE}{script}"), dir.path()).is_none() {
+        return;
+    }
+    let path = |name: &str| dir.path().join(format!("{name}.hdf5"));
+    for (name, field, rows) in [
+        ("alias", "terminated", 1003),
+        ("minari", "episode_2/terminations", 30),
+        ("robomimic", "data/demo_0/dones", 1003),
+    ] {
+        let got = load(&path(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(got.transitions.terminals, vec![false; rows], "{name}");
+        let told = format!("`{field}`: created, but never written; read as its fill value");
+        assert!(got.report.to_string().contains(&told), "{}", got.report);
+    }
+    let parts = ["1004 rows", "never written", "1003 rows, as in `obs`"];
+    assert_refused(load(&path("longer")).unwrap_err(), Problem::RowCount, &path("longer"), "terminated", &parts);
+}
+
 /// The number of another filter replaces that of LZF: to the reader, the file needs a plugin.
 #[test]
 fn filters_that_are_not_read_are_named() {

@@ -215,9 +215,15 @@ impl Bc {
             CloneLoss::Likelihood => PolicyForm::TanhGaussian,
         };
         let policy = ActorConfig { form, ..config.actor.clone() };
-        let actor = |k: usize| match k {
-            0 => Actor::new(buffer, &policy, steps, device),
-            k => Actor::named(&format!("policy {k}"), buffer, &policy, steps, device),
+        let actor = |k: usize| -> Result<Actor, LearnError> {
+            let actor = match k {
+                0 => Actor::new(buffer, &policy, steps, device)?,
+                k => Actor::named(&format!("policy {k}"), buffer, &policy, steps, device)?,
+            };
+            Ok(match config.loss {
+                CloneLoss::Squared => actor,
+                CloneLoss::Likelihood => actor.sampling_as_cloned(),
+            })
         };
         let actors = (0..config.ensemble).map(actor).collect::<Result<_, _>>()?;
         let told = config.dropout == OrAuto::Auto;

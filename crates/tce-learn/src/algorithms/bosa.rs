@@ -25,6 +25,9 @@
 //! is therefore another threshold: with β² = .125 every perfectly modelled dimension adds .12 to ln p̂. In our runs the
 //! mask keeps 95 % of the rows (Ant) or more.
 //!
+//! Where s' is unknown, at terminal rows of logs without next states, there is no density. Such rows count (m = 1), because
+//! their y needs no s'; the autoencoders do not see them. In the published form y would need it, so that they do not count.
+//!
 //! **Published**: ODRL's buffer returns 1 - terminal, but its BOSA uses this value as terminal. It therefore bootstraps
 //! at terminal rows only, and the critics learn the immediate reward.
 
@@ -57,7 +60,7 @@ const ABOUT: About = About {
     published: Some("critics bootstrap at terminal rows and nowhere else"),
     table: "bosa",
     needs: OtherRows::Source,
-    successors: true,
+    successors: false,
     episodes: false,
     scores: RowScores::None,
 };
@@ -196,6 +199,8 @@ pub struct Support {
     behaviour: Cvae,
     dynamics: Vec<Cvae>,
     members: Vec<Streams>,
+    /// Tells whose s' is known.
+    buffer: Buffer,
 }
 
 impl Bosa {
@@ -203,7 +208,7 @@ impl Bosa {
     /// `None` if the user interrupted their training.
     ///
     /// # Errors
-    /// If the configuration cannot be used, or there are no source rows.
+    /// If the configuration cannot be used, there are no source rows, or the s' of no row of a table is known.
     pub fn new(
         buffer: &Buffer,
         config: &BosaConfig,
@@ -214,6 +219,7 @@ impl Bosa {
         config.check()?;
         need_others("BOSA", buffer.members())?;
         let rows = Buffer::new(buffer.members().to_vec(), config.cvae.batch)?.with_stream("bosa batch");
+        let rows = rows.with_successors()?;
         let model = |modelled, name: &str| CvaeLearner::new(&rows, &config.cvae, modelled, name, device);
         let mut all = vec![model(Modelled::Behaviour, "bosa behaviour")?];
         for i in 0..config.ensemble {
@@ -230,6 +236,7 @@ impl Bosa {
             behaviour: models.next().expect("the first of them"),
             dynamics: models.collect(),
             members: buffer.streams(),
+            buffer: buffer.clone(),
             config: config.clone(),
         };
         Ok(Some(Deterministic { nets, rule }))
@@ -246,7 +253,16 @@ impl Support {
         };
         let densities: Vec<_> = self.dynamics.par_iter().enumerate().map(density).collect();
         let least = densities.into_iter().reduce(Tensor::min_pair).expect("at least one model");
-        least.greater_elem(self.config.threshold.ln()).float()
+        let mask = least.greater_elem(self.config.threshold.ln()).float();
+        counted(mask, self.buffer.known(batch, 0), self.config.mode)
+    }
+}
+
+/// m of all rows, from that of the rows whose s' is `known` (1, else 0). The others are terminal.
+fn counted(mask: Tensor<3>, known: Tensor<3>, mode: Mode) -> Tensor<3> {
+    match mode {
+        Mode::Corrected => mask.max_pair(-known + 1.0),
+        Mode::Published => mask * known,
     }
 }
 
@@ -307,5 +323,14 @@ mod tests {
         let y = |mode| host(critic_target(&batch, column([10.0, 20.0]), 0.5, mode));
         assert_eq!(y(Mode::Corrected), [6.0, 2.0]);
         assert_eq!(y(Mode::Published), [1.0, 12.0]);
+    }
+
+    /// Rows: known and supported, known and not, unknown and by chance not, unknown and by chance supported.
+    #[test]
+    fn rows_without_a_successor_count_where_they_need_none() {
+        let column = |v: [f32; 4]| tensor(v.to_vec(), [1, 4, 1], &cpu());
+        let m = |mode| host(counted(column([1.0, 0.0, 0.0, 1.0]), column([1.0, 1.0, 0.0, 0.0]), mode));
+        assert_eq!(m(Mode::Corrected), [1.0, 0.0, 1.0, 1.0]);
+        assert_eq!(m(Mode::Published), [1.0, 0.0, 0.0, 0.0]);
     }
 }

@@ -16,6 +16,9 @@
 //! | - | `lr` | 3e-4 | ODRL |
 //! | - | `mode` | corrected | published: p is a softmax of a softmax (below) |
 //!
+//! r is the raw reward: a member's `reward_scale` multiplies Δ as it multiplies r. Where s' is unknown, at terminal rows
+//! of logs without next states, Δ is 0, and the classifiers do not see the row.
+//!
 //! **Published**: ODRL's forward pass ends in a softmax, and both callers use the result as logits. L_C is then between
 //! .31 and 1.31 for every row, and its gradient vanishes where the classifier is certain. Δ should be a difference of
 //! log-odds, but becomes a difference of probabilities with |Δ| ≤ 2: no source row loses more than 2 η, not up to c η
@@ -47,7 +50,7 @@ const ABOUT: About = About {
     published: Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
     table: "dara",
     needs: OtherRows::Source,
-    successors: true,
+    successors: false,
     episodes: false,
     scores: RowScores::None,
 };
@@ -117,15 +120,17 @@ pub struct Classifiers {
     config: DaraConfig,
     sas: Trained<Mlp>,
     sa: Trained<Mlp>,
-    /// The classifiers draw their own batches from it.
+    /// The classifiers draw their own batches from it, of rows whose s' is known.
     buffer: Buffer,
+    /// What a batch has multiplied rewards by, `[P, 1, 1]`.
+    scales: Tensor<3>,
 }
 
 impl Dara {
     /// New networks for the members of `buffer`, to be trained for `steps` steps.
     ///
     /// # Errors
-    /// If a configuration cannot be used, or there are no source rows.
+    /// If a configuration cannot be used, there are no source rows, or the s' of no row of a table is known.
     pub fn new(
         buffer: &Buffer,
         config: &DaraConfig,
@@ -144,7 +149,8 @@ impl Dara {
         let transform = Classifiers {
             sas: classifier("dara sas", 2 * s + a),
             sa: classifier("dara sa", s + a),
-            buffer: buffer.clone().with_stream("dara batch"),
+            buffer: buffer.clone().with_stream("dara batch").with_successors()?,
+            scales: buffer.reward_scales(device),
             config: config.clone(),
         };
         Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, transform })
@@ -189,7 +195,7 @@ impl BatchTransform for Classifiers {
         step: u64,
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>) {
-        let Self { config: c, sas, sa, buffer } = self;
+        let Self { config: c, sas, sa, buffer, scales } = self;
         let (members, device) = (&buffer.streams(), &batch.s.device());
         let rows = buffer.sample(step, device);
         let (x, y) = join(&rows);
@@ -207,9 +213,10 @@ impl BatchTransform for Classifiers {
         let (x, y) = join(batch);
         let source = |x: Tensor<3>| x.narrow(1, first, others);
         let gap = dynamics_gap(sas.net().valid().forward(source(x)), sa.net().valid().forward(source(y)), c.mode);
-        let gap = gap.clamp(-c.clip, c.clip);
+        let gap = gap.clamp(-c.clip, c.clip) * buffer.known(batch, first);
         meter.record("dynamics_gap", &gap);
-        let r = Tensor::cat(vec![batch.r.clone().narrow(1, 0, first), source(batch.r.clone()) + gap * c.eta], 1);
+        let corrected = source(batch.r.clone()) + gap * c.eta * scales.clone();
+        let r = Tensor::cat(vec![batch.r.clone().narrow(1, 0, first), corrected], 1);
         (Minibatch { r, ..batch.clone() }, None)
     }
 
@@ -227,7 +234,46 @@ impl BatchTransform for Classifiers {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::buffer::Member;
+    use std::sync::Arc;
+    use tce_base::Streams;
+    use tce_data::{Standardizer, Transitions};
     use tce_nn::{cpu, host, tensor};
+
+    /// Two members with the same rows and networks, but for the scale of their rewards, which are all 0. Every fifth row is
+    /// terminal, and its s' is unknown.
+    #[test]
+    fn the_correction_is_in_the_units_of_the_rewards_and_needs_a_successor() {
+        let mut t = Transitions::new(1, 1);
+        for i in 0..40 {
+            let x = i as f32 / 20.0 - 0.95;
+            t.push(&[x], &[-x], 0.0, &[x], i % 5 == 4, false);
+        }
+        t.known = t.terminals.iter().map(|terminal| !terminal).collect();
+        let (t, streams, standardizer) = (Arc::new(t), Streams::new(1), Standardizer::identity(1));
+        let member = |reward_scale| Member {
+            streams,
+            parts: vec![t.clone(), t.clone()],
+            standardizer: standardizer.clone(),
+            reward_scale,
+            row_scores: None,
+        };
+        let buffer = Buffer::new(vec![member(1.0), member(10.0)], 64).unwrap();
+        let config = DaraConfig { hidden: vec![8], ..DaraConfig::default() };
+        let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
+        let mut dara = Dara::new(&buffer, &config, &iql, Regulariser::None, 1, &cpu()).unwrap();
+        let batch = buffer.sample(0, &cpu());
+        let known = buffer.known_from(&batch, 0);
+        let changed = dara.transform.transform(&dara.iql, &batch, 0, &mut Meter::default()).0;
+        assert_eq!((&changed.picks, host(changed.not_done)), (&batch.picks, host(batch.not_done)));
+        let r = host(changed.r);
+        for k in 0..64 {
+            let (one, ten) = (r[k], r[64 + k]);
+            assert_eq!(one != 0.0, k >= 32 && known[k], "row {k}: {one}");
+            assert!((10.0 * one - ten).abs() < 1e-5, "row {k}: {one} {ten}");
+        }
+        assert!(known[32..64].iter().any(|known| !known), "some source rows have no s'");
+    }
 
     fn outputs() -> Tensor<3> {
         // Rows: one target row, two source rows; columns: source, target.

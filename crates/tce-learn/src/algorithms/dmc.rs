@@ -19,6 +19,8 @@
 //!
 //! The modes do not differ in anything else.
 //!
+//! Terminal rows whose s' is unknown (logs without next states) are left out of all tables: without s' they have no score.
+//!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
 //! | - | `mode` | corrected | - |

@@ -18,6 +18,9 @@
 //! | - | `batch` | 128 target rows, 127 source rows for all of them | ODRL |
 //! | - | `mode`, `code` | corrected | published, odrl: φ and ψ stay as they were drawn; published, authors: w is its mean |
 //!
+//! Where s' is unknown, at terminal rows of logs without next states, there is no score: the row borrows that of another
+//! source row of the batch (`lend_scores` in [`crate::selection`]), and φ and ψ do not see it.
+//!
 //! **Published**: there are two public implementations. ODRL defines the training of φ and ψ but never calls it, so
 //! random networks select the rows. IGDF's authors train them, but multiply weights `[N, 1]` by squared errors `[N]`:
 //! the mean of that N × N matrix is the mean weight times L_Q, so all rows have the same weight.
@@ -37,7 +40,7 @@ use crate::mode::Mode;
 use crate::on_iql::{BatchTransform, OnIql};
 use crate::policy::PolicyLearner;
 use crate::regulariser::Regulariser;
-use crate::selection::{Selected, host_from, need_others};
+use crate::selection::{Selected, host_from, lend_scores, need_others};
 use crate::training::{Learner, Meter, Place, prepare};
 
 const ABOUT: About = About {
@@ -50,7 +53,7 @@ const ABOUT: About = About {
     ),
     table: "igdf",
     needs: OtherRows::Source,
-    successors: true,
+    successors: false,
     episodes: false,
     scores: RowScores::None,
 };
@@ -102,7 +105,7 @@ pub struct IgdfConfig {
     pub mode: Mode,
     /// Whose defect `learner.igdf.mode = "published"` has. It changes nothing where the mode is "corrected".
     pub code: Code,
-    /// ξ, the share of a batch's source rows that the critics see, those with the highest scores. Source: ODRL, .25 and .5 on some
+    /// ξ, the share of a batch's source rows that are learned from, those with the highest scores. Source: ODRL, .25 and .5 on some
     /// tasks.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub keep: f64,
@@ -149,6 +152,8 @@ struct Pair {
 pub struct Encoders {
     config: IgdfConfig,
     pair: Trained<Pair>,
+    /// Tells whose s' is known.
+    buffer: Buffer,
 }
 
 impl Encoders {
@@ -159,14 +164,16 @@ impl Encoders {
             MlpConfig::relu(inputs, &config.hidden, config.features).init(&members, name, &device)
         };
         let pair = Pair { phi: net("igdf phi", s + a), psi: net("igdf psi", s) };
-        Self { pair: Trained::new(pair), config: config.clone() }
+        Self { pair: Trained::new(pair), config: config.clone(), buffer: buffer.clone() }
     }
 
-    /// cos(φ(s, a), ψ(s')) of the rows that are not target rows, sorted by member.
+    /// cos(φ(s, a), ψ(s')) of the rows that are not target rows, sorted by member; borrowed where s' is unknown.
     fn scores(&self, batch: &Minibatch) -> Vec<f32> {
-        let sa = state_action(&batch.s, batch.a.clone());
+        let (first, sa) = (batch.target_rows, state_action(&batch.s, batch.a.clone()));
         let pair = self.pair.net().valid();
-        host_from(cosine(pair.phi.forward(sa), pair.psi.forward(batch.s2.clone())), batch.target_rows)
+        let mut scores = host_from(cosine(pair.phi.forward(sa), pair.psi.forward(batch.s2.clone())), first);
+        lend_scores(&self.buffer.known_from(batch, first), &mut scores, batch.s.dims()[1] - first);
+        scores
     }
 }
 
@@ -217,7 +224,7 @@ impl Igdf {
     /// the user interrupted their training.
     ///
     /// # Errors
-    /// If a configuration cannot be used, or there are no source rows.
+    /// If a configuration cannot be used, there are no source rows, or the s' of no row of a table is known.
     pub fn new(
         buffer: &Buffer,
         config: &IgdfConfig,
@@ -233,6 +240,7 @@ impl Igdf {
         if !config.as_in(Code::Odrl) {
             // The batch is split evenly, so there is one source row less than target rows.
             let rows = Buffer::new(buffer.members().to_vec(), 2 * config.batch - 1)?.with_stream("igdf batch");
+            let rows = rows.with_successors()?;
             if !prepare(&mut encoders, &rows, config.steps, "IGDF encoders", place, device)? {
                 return Ok(None);
             }

@@ -6,7 +6,7 @@
 //! L_π = mean over steps and action dimensions of (π_t - a_t)²                → DT
 //! ```
 //!
-//! Half of a member's segments are from the target, half from the source ([`crate::sequences`]).
+//! Half of a member's segments are from the target, half from the source ([`crate::sequences`]). Terminal rows whose s' is unknown are left out, as the world model needs it.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|

@@ -24,6 +24,9 @@
 //! tenth of these weights are 100, so their mean is 10 or more. The preset `default` uses exp(u / std u), with a mean
 //! of 1.2 to 1.5. There the same β_reg constrains the policy several times more. `--preset paper` has OTDF's scale.
 //!
+//! Terminal rows whose s' is unknown (logs without next states) are left out of both tables: without s' they have no cost
+//! of transport.
+//!
 //! OTDF's loader also uses the next row as s' across the ends of episodes; this is not repeated here.
 
 use serde::{Deserialize, Serialize};
@@ -83,7 +86,7 @@ impl Method for OtdfConfig {
 pub struct OtdfConfig {
     /// Whether every row is cloned with its own weight, or, as the public code has it, with the mean weight of its batch.
     pub mode: Mode,
-    /// Share of a batch's source rows that the critics see: those with the least cost of transport to the target. Source: OTDF's
+    /// Share of a batch's source rows that are learned from: those with the least cost of transport to the target. Source: OTDF's
     /// command line; its file says .25.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub keep: f64,

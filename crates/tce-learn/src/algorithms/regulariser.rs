@@ -26,6 +26,7 @@ use crate::buffer::{Buffer, Minibatch};
 use crate::cvae::{Cvae, CvaeConfig, Density, train_cvae};
 use crate::error::LearnError;
 use crate::losses::member_mean;
+use crate::shares::split;
 use crate::training::Place;
 
 /// Which term; see the [module](self).
@@ -62,6 +63,21 @@ impl RegulariserConfig {
     }
 }
 
+/// Refuses members whose batches hold different numbers of target rows. `forward_kl` counts the same rows of all of them, so that the
+/// result of a member would depend on the others.
+fn same_target_rows(buffer: &Buffer) -> Result<(), LearnError> {
+    let rows: Vec<usize> = buffer.members().iter().map(|m| split(buffer.batch(), &m.parts)[0]).collect();
+    match rows.iter().position(|n| *n != rows[0]) {
+        None => Ok(()),
+        Some(m) => Err(LearnError::invalid(
+            "regulariser = forward_kl",
+            format!("{} target rows in a batch of member 0, {} of member {m}", rows[0], rows[m]),
+            "as many of every member",
+            "train members with other rows and those without in two populations",
+        )),
+    }
+}
+
 /// A prepared term.
 pub enum Regulariser {
     /// No term.
@@ -90,7 +106,8 @@ impl Regulariser {
     /// Trains the model that the term needs, on the target rows of `buffer`. `None` if the user interrupted it.
     ///
     /// # Errors
-    /// If the configuration cannot be used, or a checkpoint cannot be read or written.
+    /// If the configuration cannot be used, the batches of two members have different numbers of target rows (`forward_kl`), or a
+    /// checkpoint cannot be read or written.
     pub fn prepare(
         kind: RegulariserKind,
         buffer: &Buffer,
@@ -109,6 +126,9 @@ impl Regulariser {
                 "positive numbers",
                 "correct the configuration",
             ));
+        }
+        if kind == RegulariserKind::ForwardKl {
+            same_target_rows(buffer)?;
         }
         let Some(cvae) = train_cvae(buffer, &config.cvae, place, device)? else { return Ok(None) };
         Ok(Some(match kind {

@@ -20,7 +20,7 @@
 //! | H̄ | `target_entropy` | -d_a | the same |
 //! | α at the start | `initial_alpha` | 1 | their code |
 //! | - | `policy_lr` | none: `lr` | ours, for a policy that is not a new one |
-//! | - | `layer_norm` | no | RLPD (Ball et al. 2023), for a policy that is not a new one |
+//! | - | `layer_norm` | no | RLPD (Ball et al. 2023), for a policy that is not a new one; behind the ReLU, in ReBRAC's order |
 //! | - | `policy_start` | 0 | ours: updates of the critics alone, where the policy is not a new one |
 
 use std::path::Path;
@@ -54,7 +54,8 @@ pub struct SacConfig {
     pub policy_lr: Option<f64>,
     /// Hidden layers of policy and critics.
     pub hidden: Vec<usize>,
-    /// Layer normalisation in the critics. It avoids extreme values between tried actions (Ball et al. 2023).
+    /// Layer normalisation in the critics, behind the ReLU as in ReBRAC (in RLPD before it). It avoids extreme values
+    /// between tried actions (Ball et al. 2023).
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub layer_norm: bool,
     /// H̄; `None` means -d_a.

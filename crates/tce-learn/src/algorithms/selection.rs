@@ -65,6 +65,22 @@ pub fn scores_of_others(members: &[crate::Member], batch: &Minibatch) -> Vec<f32
     members.iter().zip(batch.picks.chunks(b)).flat_map(of).collect()
 }
 
+/// Gives rows that cannot be scored, because their s' is not `known`, the score of the row before them, or of the last one
+/// for the first: both slices have `others` rows for each member. The rows of a batch are in random order, so that such rows, which are
+/// terminal, are kept as often and weighed as much as others. 0 if no row of a member can be scored.
+pub(crate) fn lend_scores(known: &[bool], scores: &mut [f32], others: usize) {
+    for (scores, known) in scores.chunks_mut(others.max(1)).zip(known.chunks(others.max(1))) {
+        let mut last = scores.iter().zip(known).rev().find(|(_, known)| **known).map_or(0.0, |(score, _)| *score);
+        for (score, known) in scores.iter_mut().zip(known) {
+            if *known {
+                last = *score;
+            } else {
+                *score = last;
+            }
+        }
+    }
+}
+
 /// Returns an error for members without source rows, which `method` needs.
 pub(crate) fn need_others(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
     match members.iter().position(|m| m.parts.len() != 2 || m.parts[1].is_empty()) {
@@ -139,6 +155,16 @@ mod tests {
         assert_eq!(host(kept.batch.r.clone()), host(kept.batch.s2.clone()));
         assert_eq!(host(kept.weights), [1.0, 1.0, 5.0, 20.0, 1.0, 1.0, 30.0, 20.0]);
         assert_eq!((kept.batch.target_rows, kept.batch.picks[3].row), (2, 4));
+    }
+
+    #[test]
+    fn rows_without_a_successor_borrow_a_score() {
+        let known = [false, true, false, false, true, true, false, false, false, false];
+        let mut scores = [9.0, 1.0, 9.0, 9.0, 2.0, 3.0, 9.0, 9.0, 9.0, 9.0];
+        lend_scores(&known, &mut scores, 5);
+        assert_eq!(scores, [2.0, 1.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0]);
+        lend_scores(&known[6..], &mut scores[6..], 4);
+        assert_eq!(scores[6..], [0.0; 4], "none can be scored");
     }
 
     proptest! {

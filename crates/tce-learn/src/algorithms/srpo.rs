@@ -15,6 +15,8 @@
 //! | - | `lr` | 1e-3 | the same |
 //! | - | `mode` | corrected | published: x is the logit D(s) itself |
 //!
+//! r is the raw reward: a member's `reward_scale` multiplies the added term as it multiplies r.
+//!
 //! IGDF's authors base it on another IQL (Gaussian log-likelihood for the policy:
 //! `learner.iql.policy_extraction = "awr_logprob"`); here all prior methods use the same IQL.
 //!
@@ -45,7 +47,7 @@ const ABOUT: About = About {
     published: Some("the discriminator's logit is clamped where its odds are meant"),
     table: "srpo",
     needs: OtherRows::Any,
-    successors: true,
+    successors: false,
     episodes: false,
     scores: RowScores::None,
 };
@@ -112,6 +114,8 @@ pub type Srpo = OnIql<Discriminator>;
 pub struct Discriminator {
     config: SrpoConfig,
     net: Trained<Mlp>,
+    /// What a batch has multiplied rewards by, `[P, 1, 1]`.
+    scales: Tensor<3>,
 }
 
 impl Srpo {
@@ -130,7 +134,8 @@ impl Srpo {
         config.check()?;
         let net = MlpConfig::relu(buffer.inputs().len(), &config.hidden, 1);
         let net = net.init(&buffer.streams(), "srpo", &device.clone().autodiff());
-        let transform = Discriminator { config: config.clone(), net: Trained::new(net) };
+        let (config, net, scales) = (config.clone(), Trained::new(net), buffer.reward_scales(device));
+        let transform = Discriminator { config, net, scales };
         Ok(OnIql { iql: Iql::new(buffer, iql, regulariser, steps, device)?, transform })
     }
 }
@@ -164,14 +169,14 @@ impl BatchTransform for Discriminator {
         _step: u64,
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>) {
-        let Self { config: c, net } = self;
+        let Self { config: c, net, scales } = self;
         let labels = high_value_labels(iql.values(batch.s.clone()), c.share);
         let loss = binary_cross_entropy(net.net().forward(batch.s.clone()), labels);
         meter.record("discriminator_loss", &loss);
         net.step(loss.sum(), c.lr);
         let shift = reward_shift(net.net().valid().forward(batch.s.clone()), c);
         meter.record("reward_shift", &shift);
-        (Minibatch { r: batch.r.clone() + shift, ..batch.clone() }, None)
+        (Minibatch { r: batch.r.clone() + shift * scales.clone(), ..batch.clone() }, None)
     }
 
     fn save(&self, state: &mut NamedParameters) {
@@ -186,6 +191,10 @@ impl BatchTransform for Discriminator {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::buffer::Member;
+    use std::sync::Arc;
+    use tce_base::Streams;
+    use tce_data::{Standardizer, Transitions};
     use tce_nn::cpu;
 
     #[test]
@@ -200,6 +209,33 @@ mod tests {
             let corrected = 0.3 * x.exp().clamp(0.1, 10.0).ln();
             assert!((shift(Mode::Published)[k] - published).abs() < 1e-6);
             assert!((shift(Mode::Corrected)[k] - corrected).abs() < 1e-6);
+        }
+    }
+
+    /// Two members with the same rows and networks: what is added to a reward is multiplied as the reward is.
+    #[test]
+    fn the_term_is_in_the_units_of_the_rewards() {
+        let mut t = Transitions::new(1, 1);
+        for i in 0..20 {
+            let x = i as f32 / 10.0 - 0.95;
+            t.push(&[x], &[x], 0.0, &[x], false, i % 5 == 4);
+        }
+        let (t, streams, standardizer) = (Arc::new(t), Streams::new(1), Standardizer::identity(1));
+        let member = |reward_scale| Member {
+            streams,
+            parts: vec![t.clone()],
+            standardizer: standardizer.clone(),
+            reward_scale,
+            row_scores: None,
+        };
+        let buffer = Buffer::new(vec![member(1.0), member(10.0)], 8).unwrap();
+        let config = SrpoConfig { hidden: vec![8], ..SrpoConfig::default() };
+        let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
+        let mut srpo = Srpo::new(&buffer, &config, &iql, Regulariser::None, 1, &cpu()).unwrap();
+        let batch = buffer.sample(0, &cpu());
+        let r = host(srpo.transform.transform(&srpo.iql, &batch, 0, &mut Meter::default()).0.r);
+        for (&one, &ten) in r[..8].iter().zip(&r[8..]) {
+            assert!(one != 0.0 && (10.0 * one - ten).abs() < 1e-5, "{one} {ten}");
         }
     }
 

@@ -49,6 +49,8 @@ pub struct Buffer {
     stream: &'static str,
     /// The step from which on batches hold target rows alone.
     fade: Option<u64>,
+    /// Whether only rows whose s' is known are drawn.
+    successors: bool,
     /// [`continued`] of every member's parts, from the first call of [`Buffer::next_actions`] on.
     continued: OnceLock<Vec<Vec<Vec<bool>>>>,
 }
@@ -166,7 +168,7 @@ impl Buffer {
         let live = |d: &usize| members.iter().any(|m| !m.standardizer.dead.contains(d));
         let inputs = (0..dims.0).filter(live).collect();
         let (stream, continued) = ("batch", OnceLock::new());
-        Ok(Self { members, batch, inputs, act_dim: dims.1, stream, fade: None, continued })
+        Ok(Self { members, batch, inputs, act_dim: dims.1, stream, fade: None, successors: false, continued })
     }
 
     /// The same with batches from another stream: two learners with one seed must not draw the same rows at every step.
@@ -178,6 +180,24 @@ impl Buffer {
     /// `until`. Their places go to the target.
     pub fn fading(self, until: Option<u64>) -> Self {
         Self { fade: until, ..self }
+    }
+
+    /// The same, where batches hold only rows whose s' is known: for models that need it. If all are known, the batches
+    /// are the same. The rows of a [`Pick`] are still those of the whole tables.
+    ///
+    /// # Errors
+    /// If a table has rows, and the s' of none of them is known.
+    pub(crate) fn with_successors(self) -> Result<Self, LearnError> {
+        for (m, member) in self.members.iter().enumerate() {
+            for (p, part) in member.parts.iter().enumerate() {
+                if !part.is_empty() && !part.known.contains(&true) {
+                    let (field, found) = (format!("member {m}, part {p}"), format!("{} rows without s'", part.len()));
+                    let remedy = "record the next states as `next_observations`";
+                    return Err(LearnError::invalid(field, found, "at least one row with s'", remedy));
+                }
+            }
+        }
+        Ok(Self { successors: true, ..self })
     }
 
     /// Rows of each of `parts` in the batch of `step`.
@@ -197,7 +217,8 @@ impl Buffer {
         let parts = vec![Arc::new(Transitions::new(dims.0, dims.1))];
         let member = Member { streams, parts, standardizer, reward_scale: 1.0, row_scores: None };
         let (stream, continued) = ("batch", OnceLock::new());
-        Self { members: vec![member], batch, inputs, act_dim: dims.1, stream, fade: None, continued }
+        let members = vec![member];
+        Self { members, batch, inputs, act_dim: dims.1, stream, fade: None, successors: false, continued }
     }
 
     /// The table of a replay buffer, to add rows to.
@@ -259,7 +280,10 @@ impl Buffer {
             target_rows = target_rows.min(split[0]);
             for (k, (part, &rows)) in member.parts.iter().zip(&split).enumerate() {
                 for _ in 0..rows {
-                    let i = rng.random_range(0..part.len());
+                    let mut i = rng.random_range(0..part.len());
+                    while self.successors && !part.known[i] {
+                        i = rng.random_range(0..part.len());
+                    }
                     self.push(member, part.observation(i), &mut s);
                     self.push(member, part.next_observation(i), &mut s2);
                     actions.extend_from_slice(part.action(i));
@@ -278,6 +302,29 @@ impl Buffer {
             target_rows,
             picks,
         }
+    }
+
+    /// Whether s' is known, for the rows of a batch of these members from row `first` on, sorted by member. A row whose
+    /// s' is not known is terminal: no target of a critic needs it.
+    pub(crate) fn known_from(&self, batch: &Minibatch, first: usize) -> Vec<bool> {
+        let b = batch.s.dims()[1];
+        let of = |(member, picks): (&Member, &[Pick])| -> Vec<bool> {
+            picks[first..].iter().map(|pick| member.parts[pick.part as usize].known[pick.row as usize]).collect()
+        };
+        self.members.iter().zip(batch.picks.chunks(b)).flat_map(of).collect()
+    }
+
+    /// [`Buffer::known_from`] as numbers, 1 if it is known, else 0, `[P, B - first, 1]`.
+    pub(crate) fn known(&self, batch: &Minibatch, first: usize) -> Tensor<3> {
+        let known: Vec<f32> = self.known_from(batch, first).into_iter().map(f32::from).collect();
+        let p = self.members.len();
+        let rows = known.len() / p;
+        tensor(known, [p, rows, 1], &batch.s.device())
+    }
+
+    /// The members' reward scales `[P, 1, 1]`: the factors on what a method adds to rewards.
+    pub(crate) fn reward_scales(&self, device: &Device) -> Tensor<3> {
+        tensor(self.members.iter().map(|m| m.reward_scale).collect(), [self.members.len(), 1, 1], device)
     }
 
     /// The actions of the next rows `[P, B, d_a]`, and 1 if the data contain them, else 0, `[P, B, 1]`. The next row
@@ -381,113 +428,4 @@ pub fn best_trajectories(t: &Transitions, top: f64) -> Result<Transitions, Learn
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use tce_nn::{cpu, host};
-
-    /// Row i: s = [i, 7], a = [-i], r = i, s' = [i + 1, 7]; three trajectories of returns 0+1, 2+3+4 and 5 (cut).
-    fn table() -> Transitions {
-        let mut t = Transitions::new(2, 1);
-        for i in 0..6 {
-            let x = i as f32;
-            t.push(&[x, 7.0], &[-x], x, &[x + 1.0, 7.0], i == 1, i == 4);
-        }
-        t
-    }
-
-    fn member(seed: u64, parts: Vec<Transitions>) -> Member {
-        let standardizer = Standardizer::fit(&parts[0].observations, 2);
-        let parts = parts.into_iter().map(Arc::new).collect();
-        Member { streams: Streams::new(seed), parts, standardizer, reward_scale: 2.0, row_scores: None }
-    }
-
-    #[test]
-    fn rows_stay_together_and_dead_inputs_are_left_out() {
-        let buffer = Buffer::new(vec![member(1, vec![table(), table()]), member(2, vec![table()])], 9).unwrap();
-        assert_eq!(buffer.inputs(), [0]);
-        let batch = buffer.sample(3, &cpu());
-        assert_eq!((batch.s.dims(), batch.target_rows), ([2, 9, 1], 5));
-        let (s, a, r, s2, nd) = (host(batch.s), host(batch.a), host(batch.r), host(batch.s2), host(batch.not_done));
-        let z = &buffer.members()[0].standardizer;
-        for (k, pick) in batch.picks.iter().enumerate() {
-            let x = pick.row as f32;
-            assert_eq!(pick.part, u32::from((5..9).contains(&k)));
-            assert_eq!((a[k], r[k], nd[k]), (-x, 2.0 * x, f32::from(pick.row != 1)));
-            assert_eq!((s[k], s2[k]), ((x - z.mean[0]) / z.std[0], (x + 1.0 - z.mean[0]) / z.std[0]));
-        }
-    }
-
-    #[test]
-    fn kept_rows_stay_whole() {
-        let buffer =
-            Buffer::new(vec![member(1, vec![table(), table()]), member(2, vec![table(), table()])], 8).unwrap();
-        let batch = buffer.sample(0, &cpu());
-        let rows = [vec![0, 1, 3, 5], vec![2, 3, 6, 7]];
-        let kept = batch.keep(&rows);
-        assert_eq!((kept.s.dims(), kept.a.dims(), kept.target_rows), ([2, 4, 1], [2, 4, 1], 2));
-        let columns = |b: &Minibatch| [&b.s, &b.a, &b.r, &b.s2, &b.not_done].map(|t| host(t.clone()));
-        let (all, some) = (columns(&batch), columns(&kept));
-        for (k, at) in rows.iter().enumerate().flat_map(|(m, r)| r.iter().map(move |i| 8 * m + i)).enumerate() {
-            assert_eq!(kept.picks[k], batch.picks[at]);
-            for (some, all) in some.iter().zip(&all) {
-                assert_eq!(some[k], all[at]);
-            }
-        }
-        assert_eq!(batch.keep(&[vec![0, 1], vec![1, 2]]).target_rows, 2, "target rows alone");
-    }
-
-    #[test]
-    fn next_actions_stay_within_episodes() {
-        let buffer = Buffer::new(vec![member(1, vec![table()])], 40).unwrap();
-        let batch = buffer.sample(0, &cpu());
-        let (actions, known) = buffer.next_actions(&batch);
-        for ((pick, a), known) in batch.picks.iter().zip(host(actions)).zip(host(known)) {
-            // Rows 1 and 4 end their episodes, row 5 ends the table.
-            let expected = if [1, 4, 5].contains(&pick.row) { (0.0, 0.0) } else { (-(pick.row as f32) - 1.0, 1.0) };
-            assert_eq!((a, known), expected, "row {}", pick.row);
-        }
-    }
-
-    #[test]
-    fn a_member_draws_the_same_rows_alone() {
-        let two = Buffer::new(vec![member(1, vec![table()]), member(2, vec![table()])], 4).unwrap();
-        let one = Buffer::new(vec![member(2, vec![table()])], 4).unwrap();
-        assert_eq!(two.sample(5, &cpu()).picks[4..], one.sample(5, &cpu()).picks);
-        assert_ne!(one.sample(5, &cpu()).picks, one.sample(6, &cpu()).picks);
-    }
-
-    #[test]
-    fn bad_input_is_refused() {
-        let empty = Transitions::new(2, 1);
-        let other = Transitions::new(3, 1);
-        for (members, batch, needle) in [
-            (vec![], 4, "members"),
-            (vec![member(1, vec![table(), other])], 4, "member 0, part 1"),
-            (vec![member(1, vec![table(), table()])], 1, "batch"),
-        ] {
-            let error = Buffer::new(members, batch).unwrap_err().to_string();
-            assert!(error.contains(needle), "{error}");
-        }
-        let mut without_target = member(1, vec![table()]);
-        without_target.parts.insert(0, Arc::new(empty));
-        let scored = Member { row_scores: Some(Arc::new(vec![0.0; 5])), ..member(1, vec![table(), table()]) };
-        assert!(Buffer::new(vec![scored], 4).unwrap_err().to_string().contains("member 0, row_scores"));
-        assert!(Buffer::new(vec![without_target], 4).unwrap_err().to_string().contains("target"));
-    }
-
-    #[test]
-    fn the_best_trajectories_are_whole_ones() {
-        // Returns 1, 9 and 5.
-        assert_eq!(best_trajectories(&table(), 0.1).unwrap().rewards, [2.0, 3.0, 4.0]);
-        assert_eq!(best_trajectories(&table(), 0.34).unwrap().rewards, [2.0, 3.0, 4.0, 5.0]);
-        assert_eq!(best_trajectories(&table(), 2.0 / 3.0).unwrap().len(), 4);
-        assert_eq!(best_trajectories(&table(), 1.0).unwrap().len(), 6);
-        assert!(best_trajectories(&table(), 0.0).is_err());
-    }
-
-    #[test]
-    fn rewards_scale_by_the_range_of_returns() {
-        assert_eq!(return_range_scale(&[&table()]).unwrap(), 125.0);
-        assert!(return_range_scale(&[&Transitions::new(1, 1)]).is_err());
-    }
-}
+mod tests;

@@ -70,7 +70,7 @@ pub struct LabelErrors {
     pub rows: usize,
     /// Error of the actions, over rows and components.
     pub action_rmse: f64,
-    /// Standard deviation of the actions, for comparison.
+    /// Standard deviation of the actions, each component around its own mean, for comparison: the error of always taking the mean action.
     pub action_std: f64,
     /// Share of predicted components outside [-1, 1].
     pub outside_box: f64,
@@ -165,10 +165,10 @@ impl LabelModels {
             (!t.is_empty()).then(|| LabelErrors {
                 rows: t.len(),
                 action_rmse: rmse(&actions[m], &t.actions),
-                action_std: spread(&t.actions),
+                action_std: spread(&t.actions, t.act_dim),
                 outside_box: outside_box(&actions[m]),
                 reward_rmse: rmse(&rewards[m], &t.rewards),
-                reward_std: spread(&t.rewards),
+                reward_std: spread(&t.rewards, 1),
                 terminal_error: terminals.as_ref().map(wrong),
             })
         };
@@ -312,12 +312,27 @@ pub fn rmse(predicted: &[f32], actual: &[f32]) -> f64 {
     (sum / actual.len() as f64).sqrt()
 }
 
-fn spread(values: &[f32]) -> f64 {
-    let n = values.len() as f64;
-    let mean = values.iter().map(|&v| v as f64).sum::<f64>() / n;
-    (values.iter().map(|&v| (v as f64 - mean).powi(2)).sum::<f64>() / n).sqrt()
+/// Root mean square of the differences of a table with `columns` columns from the columns' means.
+fn spread(values: &[f32], columns: usize) -> f64 {
+    let rows = (values.len() / columns) as f64;
+    let mean = |k: usize| values.iter().skip(k).step_by(columns).map(|&v| v as f64).sum::<f64>() / rows;
+    let means: Vec<f64> = (0..columns).map(mean).collect();
+    let squares = values.iter().enumerate().map(|(i, &v)| (v as f64 - means[i % columns]).powi(2));
+    (squares.sum::<f64>() / values.len() as f64).sqrt()
 }
 
 fn outside_box(actions: &[f32]) -> f64 {
     actions.iter().filter(|a| a.abs() > 1.0).count() as f64 / actions.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two components around 5 and -5 that differ by 1 from there: the distance of the two is no spread.
+    #[test]
+    fn the_spread_is_component_by_component() {
+        assert_eq!(spread(&[6.0, -4.0, 4.0, -6.0, 6.0, -4.0, 4.0, -6.0], 2), 1.0);
+        assert_eq!(spread(&[1.0, 3.0], 1), 1.0);
+    }
 }

@@ -210,6 +210,7 @@ impl Actor {
             activation: Activation::Relu,
             output_activation,
             head: head.clone(),
+            log_std_range: None,
         };
         let specs: Vec<PolicySpec> = buffer.members().iter().map(spec).collect();
         let device = device.clone().autodiff();
@@ -220,12 +221,21 @@ impl Actor {
         Ok(Self { net: Trained::new(net), config: config.clone(), specs, steps })
     }
 
+    /// The same policies, which sample in the range of ln σ that [`Actor::likelihood_loss`] trains: outside of it the
+    /// network's ln σ has learned nothing.
+    pub(crate) fn sampling_as_cloned(mut self) -> Self {
+        self.specs.iter_mut().for_each(|spec| spec.log_std_range = Some(CLONE_LOG_STD_RANGE));
+        self
+    }
+
     /// Replaces the initial weights by those of `policy`, which was read from `path`; the optimiser stays new.
     ///
     /// # Errors
     /// If it is not a network with the same inputs, layers and form, or this population has several members.
     pub fn begin_with(&mut self, policy: &MlpPolicy, path: &Path) -> Result<(), LearnError> {
-        if self.specs.len() != 1 || *policy.spec() != self.specs[0] {
+        // A clone by likelihood has a range of ln σ of its own, which does not matter to who goes on training it.
+        let given = PolicySpec { log_std_range: None, ..policy.spec().clone() };
+        if self.specs.len() != 1 || given != self.specs[0] {
             let (path, field) = (path.to_owned(), "policy".to_owned());
             let say = |s: &PolicySpec| {
                 let plain =

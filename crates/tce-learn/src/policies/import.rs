@@ -85,6 +85,7 @@ pub fn load_npz(path: &Path) -> Result<MlpPolicy, LearnError> {
         activation,
         output_activation: Activation::Identity,
         head,
+        log_std_range: None,
     };
     let mut weights = NamedParameters::default();
     for (k, (w, b)) in layers.into_iter().enumerate() {

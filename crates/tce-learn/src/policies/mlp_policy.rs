@@ -6,7 +6,7 @@
 //! |---|---|---|---|
 //! | [`Head::Mean`] | clip(z) | the same | deterministic tanh policies (BC, IQL of OTDF); ARS |
 //! | [`Head::Gaussian`] | clip(z) | clip(z + σ n) | IQL of its authors, PPO, TRPO, A2C |
-//! | [`Head::TanhGaussian`] | tanh(μ), z = (μ, ln σ) | tanh(μ + σ n), ln σ clipped to [-20, 2] | SAC, OTDF |
+//! | [`Head::TanhGaussian`] | tanh(μ), z = (μ, ln σ) | tanh(μ + σ n), ln σ clipped to [-20, 2] or to `log_std_range` | SAC, OTDF; clones by likelihood |
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ use tce_nn::{Activation, Mlp, MlpConfig, Module, NamedParameters, cpu, host, ten
 
 use crate::error::LearnError;
 
-/// Range of ln σ of a state-dependent Gaussian head.
+/// Range of ln σ of a state-dependent Gaussian head, unless [`PolicySpec::log_std_range`] gives another.
 pub const LOG_STD_RANGE: (f32, f32) = (-20.0, 2.0);
 
 /// Key of the specification in a policy file's metadata.
@@ -60,6 +60,10 @@ pub struct PolicySpec {
     pub output_activation: Activation,
     /// Converts the output to an action.
     pub head: Head,
+    /// Range of ln σ of [`Head::TanhGaussian`], if it was trained in another one than [`LOG_STD_RANGE`]. Files of other
+    /// policies do not have this key.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub log_std_range: Option<(f32, f32)>,
 }
 
 impl PolicySpec {
@@ -90,6 +94,10 @@ impl PolicySpec {
         }
         if let Some(clip) = self.clip.filter(|clip| clip.is_nan() || *clip < 0.0) {
             return Some(("clip", clip.to_string(), "a number from 0 on".into()));
+        }
+        let none = |(low, high): &(f32, f32)| low.is_nan() || high.is_nan() || low > high;
+        if let Some((low, high)) = self.log_std_range.filter(none) {
+            return Some(("log_std_range", format!("{low}, {high}"), "two numbers, the lower one first".into()));
         }
         match &self.head {
             Head::Gaussian { log_std } if log_std.len() != self.actions => {
@@ -211,6 +219,7 @@ impl MlpPolicy {
         }
         let z = &spec.standardizer;
         let bound = spec.clip.unwrap_or(f32::INFINITY);
+        let (low, high) = spec.log_std_range.unwrap_or(LOG_STD_RANGE);
         let mut x = Vec::with_capacity(rows * spec.inputs.len());
         for row in observations.chunks_exact(spec.observations) {
             x.extend(spec.inputs.iter().map(|&d| ((row[d] - z.mean[d]) / z.std[d]).clamp(-bound, bound)));
@@ -229,7 +238,7 @@ impl MlpPolicy {
                     Head::Mean => out[d].clamp(-1.0, 1.0),
                     Head::Gaussian { log_std } => (out[d] + log_std[d].exp() * noise[d]).clamp(-1.0, 1.0),
                     Head::TanhGaussian => {
-                        let log_std = out[a + d].clamp(LOG_STD_RANGE.0, LOG_STD_RANGE.1);
+                        let log_std = out[a + d].clamp(low, high);
                         (out[d] + log_std.exp() * noise[d]).tanh()
                     }
                 };
@@ -266,6 +275,7 @@ mod tests {
             activation: Activation::Relu,
             output_activation: Activation::Identity,
             head,
+            log_std_range: None,
         }
     }
 
@@ -315,6 +325,33 @@ mod tests {
             let far = all.iter().zip(&one).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(far < 1e-6, "{far}");
         }
+    }
+
+    /// In a range of one number, that number is ln σ at every state.
+    #[test]
+    fn a_range_of_its_own_is_kept_in_the_file() {
+        let wide = policy(Head::TanhGaussian);
+        let mut spec = wide.spec().clone();
+        assert!(!serde_json::to_string(&spec).unwrap().contains("range"), "files of other policies stay as they are");
+        spec.log_std_range = Some((-1.5, -1.5));
+        let own = MlpPolicy::new(spec.clone(), &wide.to_parameters(), KEY, Path::new("x")).unwrap();
+        let own = MlpPolicy::from_parameters(&own.to_parameters(), Path::new("x")).unwrap();
+        assert_eq!(own.spec(), &spec);
+        let (o, rng) = (observations(4), |i: usize| Streams::new(2).indexed("act", i as u64));
+        let (mut mean, mut sampled) = (vec![0.0; 8], vec![0.0; 8]);
+        own.act(&o, None, &mut mean);
+        own.act(&o, Some(&mut (0..4).map(rng).collect::<Vec<_>>()), &mut sampled);
+        for i in 0..4 {
+            let mut n = [0.0; 2];
+            fill_normal(&mut rng(i), &mut n);
+            for d in 0..2 {
+                let expected = (mean[2 * i + d].atanh() + (-1.5f32).exp() * n[d]).tanh();
+                assert!((sampled[2 * i + d] - expected).abs() < 1e-5);
+            }
+        }
+        spec.log_std_range = Some((1.0, -1.0));
+        let error = MlpPolicy::new(spec, &wide.to_parameters(), KEY, Path::new("x")).unwrap_err().to_string();
+        assert!(error.contains("log_std_range: found 1, -1"), "{error}");
     }
 
     #[test]

@@ -269,6 +269,7 @@ mod tests {
             activation: Activation::Relu,
             output_activation: Activation::Identity,
             head: Head::Gaussian { log_std: vec![-0.1, 1.0 / 3.0] },
+            log_std_range: None,
         };
         let network = spec.network().init(&[Streams::new(5)], "policy", &cpu());
         from_population(vec![spec], &network).remove(0).into()

@@ -84,6 +84,8 @@ fn cloning_by_likelihood_learns_mean_and_spread() {
     let mut bc = Bc::new(&buffer, &config, 3000, &cpu()).unwrap();
     run(&mut bc, &buffer, 3000);
     let policy = &bc.policies()[0];
+    let file = &policy.to_parameters().metadata["policy"];
+    assert!(file.contains("\"log_std_range\":[-3.0,1.0]"), "it samples as it was trained: {file}");
     for (x, spread) in [(-0.6f32, 0.1f32), (-0.3, 0.1), (0.4, 0.6), (0.7, 0.6)] {
         let mean = action(policy, &[x])[0].atanh();
         assert!((mean - 0.8 * x).abs() < 0.1, "mean at {x}: {mean}");
@@ -348,6 +350,20 @@ fn regularisers_pull_the_policy_to_the_target_behaviour() {
         let a = actions(kind, beta_reg);
         assert!(a.iter().all(|a| *a > 0.45), "{kind:?}: {a:?}");
     }
+}
+
+/// One member learns from target rows alone, the other from source rows, too: it has half as many target rows in a batch.
+#[test]
+fn members_with_other_shares_of_target_rows_are_refused_where_they_would_meet() {
+    let rows = corridor();
+    let mixed = Member { parts: vec![rows.clone(), rows.clone()], ..member(2, &rows, true) };
+    let buffer = Buffer::new(vec![member(1, &rows, true), mixed], 64).unwrap();
+    let mut config = RegulariserConfig { samples: 2, draws: 2, ..RegulariserConfig::paper() };
+    (config.cvae.hidden, config.cvae.steps) = (vec![8], 1);
+    let prepare = |kind| Regulariser::prepare(kind, &buffer, &config, Place::NONE, &cpu());
+    let error = prepare(RegulariserKind::ForwardKl).err().unwrap().to_string();
+    assert!(error.contains("found 64 target rows in a batch of member 0, 32 of member 1"), "{error}");
+    assert!(prepare(RegulariserKind::Otdf).is_ok() && prepare(RegulariserKind::None).is_ok());
 }
 
 /// Two corridors. In the second, rows that move right have high scores.

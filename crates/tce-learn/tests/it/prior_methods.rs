@@ -10,7 +10,7 @@ use tce_data::{Standardizer, Transitions};
 use tce_learn::cvae::CvaeConfig;
 use tce_learn::deterministic::DelayConfig;
 use tce_learn::{
-    ActorConfig, Bosa, BosaConfig, Buffer, Dara, DaraConfig, Igdf, IgdfConfig, IqlConfig, Member, Mode, Otdf,
+    ActorConfig, Bosa, BosaConfig, Buffer, Dara, DaraConfig, Igdf, IgdfConfig, IqlConfig, Member, Method, Mode, Otdf,
     OtdfConfig, Place, Policy, PolicyLearner, Rebrac, RebracConfig, Regulariser, RegulariserConfig, RegulariserKind,
     Srpo, SrpoConfig, Td3Bc, Td3BcConfig,
 };
@@ -204,6 +204,36 @@ fn whatever_is_learned_can_be_resumed_on_any_number_of_threads() {
             assert!(expected == second.state(), "{name}, {mode:?}: the resumed training is another");
         }
     }
+}
+
+/// A corridor where every fifth row is terminal and without s'; `instead` stands in its place.
+fn log(seed: u64, episodes: usize, against: f64, instead: f32) -> Transitions {
+    let mut t = corridor(seed, episodes, against);
+    for i in (4..t.len()).step_by(5) {
+        (t.terminals[i], t.timeouts[i], t.known[i]) = (true, false, false);
+        t.next_observations[i] = instead;
+    }
+    t
+}
+
+/// Terminal rows whose s' is unknown are learned from, and what stands in the place of s' has no effect.
+#[test]
+fn an_unknown_successor_has_no_effect() {
+    let learned = |name: &str, mode: Mode, instead: f32| {
+        let parts = vec![Arc::new(log(4, 60, 0.0, instead)), Arc::new(log(5, 100, 0.2, instead))];
+        let buffer = Buffer::new(vec![Member { parts, row_scores: None, ..member(1) }], 32).unwrap();
+        let mut learner = method(name, mode, &buffer, 12);
+        go(learner.as_mut(), &buffer, 0, 12);
+        learner.state()
+    };
+    for name in ["dara", "srpo", "igdf", "bosa"] {
+        for mode in [Mode::Corrected, Mode::Published] {
+            assert!(learned(name, mode, 0.0) == learned(name, mode, 50.0), "{name}, {mode:?}");
+        }
+    }
+    let (dara, srpo) = (DaraConfig::default().about(), SrpoConfig::default().about());
+    let (igdf, bosa) = (IgdfConfig::default().about(), BosaConfig::default().about());
+    assert!([dara, srpo, igdf, bosa].iter().all(|about| !about.successors), "they get all rows");
 }
 
 #[test]

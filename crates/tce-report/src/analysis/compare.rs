@@ -4,31 +4,47 @@ use tce_data::Task;
 
 use super::{Aggregate, Comparison, GAMMA};
 use crate::error::Result;
-use crate::stats::{Bootstrap, Draw, Scores, permutation_p, probability_of_improvement};
+use crate::permutation::permutation_p;
+use crate::stats::{Bootstrap, Draw, Scores, probability_of_improvement};
 use crate::study::Study;
 
-/// Which methods are compared, on which tasks, and which methods are left out, all ascending. Where all of them have fewer than half of the tasks that the fullest
-/// method that is no baseline has, the method with the fewest tasks is left out, one after the other, a baseline last of all: a beginning of
-/// one method must not take the others' results away.
+/// Which methods are compared, on which tasks, and which methods are left out, all ascending.
+///
+/// Where all methods together have fewer than half of the tasks that the fullest one has that is no baseline, one is left out after the
+/// other: a beginning of one method must not take the others' results away. It is the one without which the rest have most tasks in common;
+/// of equals the one with the fewest tasks, a method before a baseline. A method and a baseline with a common task stay in any case, if
+/// there are such two. At last, whatever costs no task comes back.
 fn compared(study: &Study, tasks: usize, scores: &[Vec<Vec<f64>>]) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
     let has = |t: usize, m: usize| !scores[t][m].is_empty();
     let count = |m: usize| (0..tasks).filter(|t| has(*t, m)).count();
-    let (mut kept, mut left_out): (Vec<usize>, Vec<usize>) = (0..study.methods.len()).partition(|m| count(*m) > 0);
+    let is_baseline = |m: usize| study.methods[m].baseline;
+    let mut kept: Vec<usize> = (0..study.methods.len()).filter(|m| count(*m) > 0).collect();
     let shared = |kept: &[usize]| -> Vec<usize> { (0..tasks).filter(|t| kept.iter().all(|m| has(*t, *m))).collect() };
     // Baselines that were run on more tasks than any method must not leave themselves alone in it.
     let fullest = |methods: &dyn Fn(usize) -> bool| kept.iter().filter(|m| methods(**m)).map(|m| count(*m)).max();
-    let most = fullest(&|m| !study.methods[m].baseline).or_else(|| fullest(&|_| true)).unwrap_or(0);
-    let least = |kept: &[usize]| {
-        kept.iter().copied().min_by_key(|m| (count(*m), study.methods[*m].baseline, std::cmp::Reverse(*m)))
+    let most = fullest(&|m| !is_baseline(m)).or_else(|| fullest(&|_| true)).unwrap_or(0);
+    let paired = |kept: &[usize]| {
+        kept.iter().any(|&m| !is_baseline(m) && kept.iter().any(|&b| is_baseline(b) && !shared(&[m, b]).is_empty()))
     };
-    while 2 * shared(&kept).len() < most.max(1)
-        && let Some(last) = least(&kept)
-    {
+    let some_pair = paired(&kept);
+    let without = |kept: &[usize], m: usize| kept.iter().copied().filter(|k| *k != m).collect::<Vec<_>>();
+    let mut left_out = Vec::new();
+    while kept.len() > 1 && 2 * shared(&kept).len() < most.max(1) {
+        let droppable = kept.iter().copied().filter(|&m| !some_pair || paired(&without(&kept, m)));
+        let gain = |&m: &usize| {
+            let tasks = shared(&without(&kept, m)).len();
+            (std::cmp::Reverse(tasks), count(m), is_baseline(m), std::cmp::Reverse(m))
+        };
+        let Some(last) = droppable.min_by_key(gain) else { break };
         kept.retain(|m| *m != last);
         left_out.push(last);
     }
-    left_out.sort_unstable();
     let places = shared(&kept);
+    let (back, mut left_out): (Vec<usize>, Vec<usize>) =
+        left_out.into_iter().partition(|m| !places.is_empty() && places.iter().all(|t| has(*t, *m)));
+    kept.extend(back);
+    kept.sort_unstable();
+    left_out.sort_unstable();
     (kept, places, left_out)
 }
 
@@ -40,7 +56,7 @@ pub(super) fn compare(
     scores: &[Vec<Vec<f64>>],
 ) -> Result<Option<Comparison>> {
     let (kept, places, left_out) = compared(study, tasks.len(), scores);
-    if kept.is_empty() {
+    if places.is_empty() {
         return Ok(None);
     }
     let of = |m: usize| Scores::new(places.iter().map(|&t| scores[t][m].clone()).collect());

@@ -1,7 +1,9 @@
 //! What came out, in sentences: the gap first, the doubt after it.
 
+use std::collections::BTreeMap;
+
 use super::{Aggregate, Analysis, Comparison, Finding, Recommendation};
-use crate::study::short;
+use crate::study::{order, short};
 
 /// Gaps below this print as 0.0.
 const LEVEL: f64 = 0.05;
@@ -122,14 +124,26 @@ fn recommended(all: &[Recommendation]) -> Option<String> {
             ))
         }
         many => {
-            let mean =
-                |f: &dyn Fn(&(&Recommendation, f64, f64)) -> f64| many.iter().map(f).sum::<f64>() / many.len() as f64;
+            // Every task counts the same, however many recommendations it has.
+            let mut by_task: BTreeMap<_, Vec<(f64, f64)>> = BTreeMap::new();
+            many.iter()
+                .for_each(|(r, score, regret)| by_task.entry(order(&r.task)).or_default().push((*score, *regret)));
+            let mean_of = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+            let mean = |f: &dyn Fn(&(f64, f64)) -> f64| {
+                mean_of(
+                    &by_task.values().map(|own| mean_of(&own.iter().map(f).collect::<Vec<_>>())).collect::<Vec<_>>(),
+                )
+            };
+            let of = match (many.len(), by_task.len()) {
+                (all, tasks) if all == tasks => format!("The recommended policies of {tasks} tasks score"),
+                (all, 1) => format!("The {all} recommended policies of one task score"),
+                (all, tasks) => format!("The {all} recommended policies of {tasks} tasks score"),
+            };
             Some(format!(
-                "The recommended policies of {} tasks score {:.1} on average. The best policy of each task scores {:.1} points more on \
-                 average: that is their mean regret.",
-                many.len(),
-                mean(&|r| r.1),
-                mean(&|r| r.2)
+                "{of} {:.1} on average. The best policies there to choose from score {:.1} points more on average: that is their \
+                 mean regret.",
+                mean(&|r| r.0),
+                mean(&|r| r.1)
             ))
         }
     }

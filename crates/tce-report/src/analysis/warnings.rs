@@ -30,10 +30,11 @@ pub(super) fn warnings(
 ) -> Vec<Warning> {
     let mut out = Vec::new();
     of_runs(study, &mut out);
+    of_settings(study, &mut out);
     of_methods(study, tasks, scores, published, &mut out);
     match comparison {
         None => warn(&mut out, "No run has a score: there are no statistics.".into(), Vec::new()),
-        Some(comparison) => of_comparison(study, tasks, comparison, &mut out),
+        Some(comparison) => of_comparison(study, tasks, scores, comparison, &mut out),
     }
     let programs: BTreeSet<&str> = study.runs.iter().map(|r| r.folder.program.as_str()).collect();
     if programs.len() > 1 {
@@ -88,6 +89,14 @@ fn of_runs(study: &Study, out: &mut Vec<Warning>) {
             diverged,
         );
     }
+    let unstable = cases(&|r| match r.member.unstable {
+        0 => None,
+        n => Some(format!("{n} of {} episodes", r.member.returns.len())),
+    });
+    if !unstable.is_empty() {
+        let text = "The physics became unstable in some episodes, which ended there. Their returns count up to that step and may mean nothing.";
+        warn(out, text.into(), unstable);
+    }
     let unscored = cases(&|r| (r.member.verdict == Verdict::Unscored).then(|| "no score".into()));
     if !unscored.is_empty() {
         let n = plural(unscored.len(), "run has", "runs have");
@@ -96,6 +105,26 @@ fn of_runs(study: &Study, out: &mut Vec<Warning>) {
             format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
             unscored,
         );
+    }
+}
+
+/// Methods whose runs have different settings, where a mean over tasks is of no one method.
+fn of_settings(study: &Study, out: &mut Vec<Warning>) {
+    for method in &study.methods {
+        let mut tasks: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+        for run in study.runs.iter().filter(|r| r.method == method.id && r.recipe.preset.is_some()) {
+            tasks.entry(run.recipe.told()).or_default().insert(run.task.to_string());
+        }
+        if tasks.len() > 1 {
+            let text = format!(
+                "{} has different settings on different tasks: its means over tasks are of no one method.",
+                method.title
+            );
+            let told = |(settings, tasks): (&String, &BTreeSet<String>)| {
+                format!("{settings}: {}", list(tasks.iter().map(String::as_str)))
+            };
+            warn(out, text, tasks.iter().map(told).collect());
+        }
     }
 }
 
@@ -162,7 +191,7 @@ fn of_methods(study: &Study, tasks: &[Task], scores: &[Vec<Vec<f64>>], published
 }
 
 /// What means over tasks leave out, and what is not proved.
-fn of_comparison(study: &Study, tasks: &[Task], c: &Comparison, out: &mut Vec<Warning>) {
+fn of_comparison(study: &Study, tasks: &[Task], scores: &[Vec<Vec<f64>>], c: &Comparison, out: &mut Vec<Warning>) {
     let title = |m: usize| study.methods[m].title.as_str();
     if c.tasks.len() < tasks.len() {
         warn(
@@ -176,14 +205,15 @@ fn of_comparison(study: &Study, tasks: &[Task], c: &Comparison, out: &mut Vec<Wa
         );
     }
     if !c.left_out.is_empty() {
-        warn(
-            out,
-            format!(
-                "Left out of the means over tasks, for lack of scores on more than half of the tasks: {}.",
-                list(c.left_out.iter().map(|m| title(*m)))
-            ),
-            Vec::new(),
-        );
+        let with_tasks = |m: &usize| {
+            let count = scores.iter().filter(|t| !t[*m].is_empty()).count();
+            format!("{} ({})", title(*m), plural(count, "task", "tasks"))
+        };
+        let names: Vec<String> = c.left_out.iter().map(with_tasks).collect();
+        let names = list(names.iter().map(String::as_str));
+        let text =
+            format!("Left out of the means over tasks, because they share too few tasks with the others: {names}.");
+        warn(out, text, Vec::new());
     }
     let finding = |wanted: Finding| -> Vec<String> {
         let is = |a: &&Aggregate| c.improvement(a).is_some_and(|(_, f)| f == wanted);

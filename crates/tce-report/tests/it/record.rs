@@ -2,10 +2,12 @@
 
 use std::fs;
 use std::path::Path;
+use std::sync::Arc;
 
 use crate::common::{add, hopper, method, one_task, quick, write_folder};
+use tce_data::{Agent, Task};
 use tce_report::folder::Verdict;
-use tce_report::{Missing, Study, analyse, merge, record};
+use tce_report::{Change, Missing, Recipe, Study, analyse, merge, record};
 
 const SCORES: [f64; 3] = [80.0, 81.0, 82.5];
 
@@ -114,7 +116,7 @@ fn other_settings_and_other_methods_of_one_name_are_columns_of_their_own() {
     let ids = |study: &Study| study.methods.iter().map(|m| m.id.clone()).collect::<Vec<_>>();
     assert_eq!(ids(&both), ["bc (demo)", "bc (mine)", "tce-og", "tce-og (mine)"]);
     assert_eq!((both.runs[6].method.as_str(), both.runs[7].method.as_str()), ("bc (mine)", "tce-og (mine)"));
-    assert!(both.notes[0].starts_with("bc: several studies have it"), "{:?}", both.notes);
+    assert!(both.notes[0].starts_with("bc: the studies have it with different settings"), "{:?}", both.notes);
     // Of other seeds, too: they are no further seeds of the same work.
     let mut late = one_task(&root.path().join("c"), &[]);
     late.methods = vec![method("bc", "BC", true)];
@@ -127,6 +129,58 @@ fn other_settings_and_other_methods_of_one_name_are_columns_of_their_own() {
     let record = read_again(&other, &root.path().join("mine.jsonl"));
     let three = merge(vec![first, other, record]);
     assert_eq!((ids(&three), three.runs.len()), (ids(&both), both.runs.len()));
+}
+
+/// Settings that a run does not use make no difference: its recipe decides. What one study lacks is found in another's column.
+#[test]
+fn runs_of_one_recipe_are_one_column_whatever_study_they_are_from() {
+    let root = tempfile::tempdir().unwrap();
+    let recipe = |changed: &[&str]| {
+        let change = |key: &&str| Change { key: (*key).into(), value: "1".into(), preset: "0".into() };
+        Arc::new(Recipe {
+            preset: Some("default".into()),
+            changed: changed.iter().map(change).collect(),
+            ..Recipe::default()
+        })
+    };
+    // One run of `bc` with a configuration of its own.
+    let one = |name: &str, seed: u64, config: &str, changed: &[&str]| {
+        let mut study = one_task(&root.path().join(name), &[]);
+        study.methods = vec![method("bc", "BC", true)];
+        study.name = name.into();
+        let directory = root.path().join(name).join("bc");
+        write_folder(&directory, &[(seed, Some(50.0))], config);
+        add(&mut study, hopper(), "bc", &directory);
+        study.runs[0].recipe = recipe(changed);
+        study
+    };
+    let columns = |study: &Study| study.runs.iter().map(|r| r.method.clone()).collect::<Vec<_>>();
+    let (first, second) = (one("first", 0, "unused = 1\n", &[]), one("second", 1, "unused = 2\n", &[]));
+    assert_eq!(columns(&merge(vec![first.clone(), second.clone()])), ["bc", "bc"], "two seeds of one method");
+    let mut third = one("third", 0, "fade = 1\n", &["fade"]);
+    third.missing.push(Missing {
+        task: hopper(),
+        method: "bc".into(),
+        seed: Some(1),
+        what: "bc, seed 1".into(),
+        why: "not done".into(),
+    });
+    let all = merge(vec![first, second, third.clone()]);
+    assert_eq!(columns(&all), ["bc (first, second)", "bc (first, second)", "bc (third)"]);
+    assert!(all.missing.is_empty(), "the second study has it: {:?}", all.missing);
+    // In one study on different tasks they stay one column, and the reader is told.
+    third.missing.clear();
+    let directory = root.path().join("ant");
+    write_folder(&directory, &[(0, Some(40.0))], "fade = 0\n");
+    add(&mut third, Task { agent: Agent::Ant, ..hopper() }, "bc", &directory);
+    third.runs[1].recipe = recipe(&[]);
+    let analysis = analyse(&third, &quick()).unwrap();
+    let told =
+        analysis.warnings.iter().find(|w| w.text.contains("BC has different settings on different tasks")).unwrap();
+    assert_eq!(
+        told.details,
+        ["preset default, fade = 1: hopper-morph/medium/expert", "preset default: ant-morph/medium/expert"]
+    );
 }
 
 #[test]

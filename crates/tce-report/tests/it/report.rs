@@ -290,7 +290,33 @@ fn a_beginning_does_not_shrink_the_comparison() {
     let (analysis, _) = page(&study);
     let c = analysis.comparison.as_ref().unwrap();
     assert_eq!((c.left_out.as_slice(), c.tasks.len()), ([5].as_slice(), 6));
-    assert!(warned(&analysis, "Left out of the means over tasks, for lack of scores on more than half of the tasks"));
+    assert!(warned(&analysis, "Left out of the means over tasks, because they share too few tasks with the others"));
+}
+
+/// Two methods, each with a baseline that the other has not: the two that can be compared are.
+#[test]
+fn a_method_and_a_baseline_with_a_common_task_are_compared() {
+    let root = tempfile::tempdir().unwrap();
+    let mut study = study(root.path());
+    let runs = study.runs.clone();
+    // TCE(OG) and one baseline on Ant alone; the other baselines on Hopper, and the other method on a third task, with more seeds of it all.
+    study.runs.retain(|r| match r.method.as_str() {
+        "tce-og" | "target-only" => r.task.agent == Agent::Ant,
+        "evil" => false,
+        _ => r.task.agent == Agent::Hopper,
+    });
+    for quality in [Quality::Medium, Quality::MediumExpert] {
+        let more = runs.iter().filter(|r| r.method == "evil" && r.task.agent == Agent::Hopper).cloned();
+        study.runs.extend(more.map(|r| Run { task: task(Agent::Walker2d, quality), ..r }));
+    }
+    let (analysis, page) = page(&study);
+    let c = analysis.comparison.as_ref().unwrap();
+    let compared: Vec<&str> = c.methods.iter().map(|a| analysis.methods[a.method].id.as_str()).collect();
+    assert_eq!(
+        (compared, c.tasks.as_slice()),
+        (vec!["target-only", "tce-og"], [task(Agent::Ant, Quality::Medium)].as_slice())
+    );
+    assert!(!page.contains("share no task") && warned(&analysis, "BC, raw (1 task)"));
 }
 
 /// Baselines on six tasks, methods on two of them: the methods are what a reader wants compared.

@@ -120,6 +120,10 @@ fn recommended_policies_have_a_score_and_a_regret() {
     cases += &format!("two tasks\n  {}\n", said(&study));
     let analysis = analyse(&study, &quick()).unwrap();
     assert!(tce_report::html::page(&study, &analysis).contains("Recommended policies and their"));
+    // Three seeds of one task are three recommendations and one task, which counts once in a mean.
+    study.recommended.push(Recommended { task: ant, ..recommended("ant-tce-og", 0, true) });
+    study.recommended.push(Recommended { task: ant, ..recommended("ant-tce-og", 1, true) });
+    cases += &format!("two tasks, four recommendations\n  {}\n", said(&study));
     insta::assert_snapshot!("recommended", cases);
 }
 

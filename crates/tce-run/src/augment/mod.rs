@@ -104,17 +104,9 @@ struct Spec<'a> {
 
 /// Runs, or takes from its stage, TCE's whole augmentation.
 fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, device: &Device) -> Result<Augmentation> {
+    let rows = rows_of(inputs, config)?;
     let (generator, place, _) = networks(inputs, config, seeds, root, device)?;
     let (models, labels, label_errors) = label_models(inputs, &config.labels, seeds, root, device)?;
-    let source = if config.generator.rows == 0 { inputs.source_rows()?.len() } else { 0 };
-    let rows = config.generator.rows_beside(config.mixture.lambda, source);
-    if rows == 0 {
-        return Err(Error::Usage(format!(
-            "generator.rows = 0 means (1 - mixture.lambda) times the source rows: found none of {source} at mixture.lambda = {}, expected at least one; \
-             give a number of rows",
-            config.mixture.lambda
-        )));
-    }
     let evaluator = filtering_models(inputs, config, root, device)?;
     let spec = Spec {
         networks: place.name(),
@@ -146,6 +138,22 @@ fn two_stages(inputs: &Inputs, config: &Config, seeds: &[u64], root: &Path, devi
     Ok(Augmentation { tables, scores, reports, stage })
 }
 
+/// How many rows are generated for every seed.
+///
+/// # Errors
+/// If there are none.
+fn rows_of(inputs: &Inputs, config: &Config) -> Result<usize> {
+    let source = if config.generator.rows == 0 { inputs.source_rows()?.len() } else { 0 };
+    match config.generator.rows_beside(config.mixture.lambda, source) {
+        0 => Err(Error::Usage(format!(
+            "generator.rows = 0 means (1 - mixture.lambda) times the source rows: found none of {source} at mixture.lambda = {}, expected at least one; \
+             give a number of rows",
+            config.mixture.lambda
+        ))),
+        rows => Ok(rows),
+    }
+}
+
 /// `rows` rows for every seed, sampled, filtered and labelled.
 fn sampled(
     generator: &Generator,
@@ -157,15 +165,16 @@ fn sampled(
     let members: Vec<_> = seeds.iter().map(|&s| Streams::new(s)).collect();
     let target = &*inputs.imitated(&config.target);
     let support = support(inputs, config);
-    let kept = Some(Chunks { directory: attempt.directory(), key: attempt.key() });
-    let draw = Draw { sampler: &config.generator.sampler, members: &members, target, kept, support: support.as_ref() };
+    let chunks = Chunks { directory: attempt.directory(), key: attempt.key() };
+    let draw = Draw::new(&config.generator.sampler, &members, target).within(support.as_ref()).keeping(chunks);
     let (states, successors) = generator.sample_pairs(rows, config.generator.y_max, &draw)?;
     let per_member = rows * generator.units.live.len();
     let pairs: Vec<_> = states.chunks(per_member).zip(successors.chunks(per_member)).collect();
     let mut finished = finisher.finish(&pairs)?;
     if let Some(evaluator) = evaluator {
         for labelled in &mut finished {
-            let keep = evaluator.possible(&labelled.transitions, config.filter.margin);
+            let possible = evaluator.possible(&labelled.transitions, config.filter.margin);
+            let keep: Vec<usize> = (0..possible.len()).filter(|&i| possible[i]).collect();
             if keep.is_empty() {
                 return Err(everything_rejected(rows, &config.filter).into());
             }

@@ -10,7 +10,9 @@ use tce_augment::single_stage::{
     SingleStage, Trained, Under, enough_to_score, evaluations, rescored, score_streams, training_of,
 };
 use tce_augment::work::Work;
-use tce_data::{DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, density_scores, load, save_d4rl};
+use tce_data::{
+    DensityOptions, DensityScale, DensityScores, LoadOptions, Rows, Transitions, density_scores, load, save_d4rl,
+};
 use tce_diffusion::{Process, Sampler, ScoreModel, Target, TrainConfig};
 use tce_nn::{Device, NamedParameters, cpu};
 
@@ -54,6 +56,11 @@ pub fn scores(inputs: &Inputs, options: &DensityOptions, root: &Path) -> Result<
     out.save(&attempt.file(file))?;
     attempt.finish(&[file.to_owned()], scores.scale)?;
     Ok(scores)
+}
+
+/// The rows that the network learns, and that a process with `start = "data"` starts from: the source's under scores, else the target's.
+fn learned(inputs: &Inputs, scored: bool) -> Result<&Transitions> {
+    if scored { inputs.source_rows() } else { Ok(&inputs.target.rows) }
 }
 
 /// The trained network, from its stage if it is there.
@@ -100,7 +107,7 @@ fn train(
     }
     let started = std::time::Instant::now();
     let attempt = stage.attempt()?;
-    let table = if scored.is_some() { inputs.source_rows()? } else { &inputs.target.rows };
+    let table = learned(inputs, scored.is_some())?;
     let kept = Kept::new(&attempt);
     let work = Work { seeds, device, keeper: &kept };
     let mut network = SingleStage::fit(table, scored.map(|s| s.source.as_slice()), config, &work)?;
@@ -124,6 +131,9 @@ pub fn augment_rows(
         sampler: Sampler,
         rows: usize,
         guidance: Option<GuidanceConfig>,
+        /// Tells rows that start at source rows from those of earlier versions, which started at target rows.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        start: Option<&'static str>,
     }
     let (own, kind) = (&config.single_stage, config.mixture.generated);
     let scored = match kind {
@@ -133,7 +143,8 @@ pub fn augment_rows(
     tce_base::begin_step("single-stage network");
     let (network, place) = train(inputs, kind, own, scored.as_ref(), seeds, root, device)?;
     let guidance = scored.as_ref().map(|_| own.guidance.clone());
-    let spec = Spec { network: place.name(), sampler: own.sampler, rows: own.rows, guidance };
+    let start = (scored.is_some() && own.process.starts_at_data()).then_some("source");
+    let spec = Spec { network: place.name(), sampler: own.sampler, rows: own.rows, guidance, start };
     tce_base::begin_step("generated rows");
     let stage = Stage::open(root, "stages/generated", &spec, device)?;
     if let Some(reports) = stage.summary::<Vec<Generated>>()? {
@@ -142,7 +153,8 @@ pub fn augment_rows(
     let attempt = stage.attempt()?;
     let kept = Kept::new(&attempt);
     let work = Work { seeds, device, keeper: &kept };
-    let sampled = network.sample(scored.as_ref().map(|s| s.source.as_slice()), &inputs.target.rows, own, &work)?;
+    let table = learned(inputs, scored.is_some())?;
+    let sampled = network.sample(scored.as_ref().map(|s| s.source.as_slice()), table, own, &work)?;
     let mut reports = Vec::new();
     for (&seed, sampled) in seeds.iter().zip(sampled) {
         let table = sampled.rows;
@@ -184,4 +196,25 @@ fn read(stage: Stage, reports: Vec<Generated>, scored: bool) -> Result<Augmentat
         scores.push(loaded.columns.remove(SCORE).map(Arc::new));
     }
     Ok(Augmentation { tables, scores, reports, stage })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::own::Own;
+
+    /// A network under scores (DmC's) has learned source rows and starts from them, one without (SynthER's) target rows.
+    #[test]
+    fn a_network_starts_from_the_rows_that_it_has_learned() {
+        let walk = |rows: usize, pace: f32| {
+            let mut t = Transitions::new(1, 1);
+            for i in 0..rows {
+                let x = pace * i as f32;
+                t.push(&[x], &[0.5], x, &[x + pace], false, i + 1 == rows);
+            }
+            Arc::new(t)
+        };
+        let inputs = Inputs::of_rows(Some(walk(40, 2.0)), walk(20, 1.0), None, &Own::default()).unwrap();
+        assert_eq!([true, false].map(|scored| learned(&inputs, scored).unwrap().len()), [40, 20]);
+    }
 }

@@ -88,8 +88,7 @@ impl Bench<'_> {
     fn measure(&self, generator: &Generator) -> Result<AtCycle> {
         let (units, sampler) = (&generator.units, self.config.generator.sampler);
         let members = [self.streams];
-        let support = self.support.as_ref();
-        let draw = Draw { support, ..Draw::new(&sampler, &members, self.target) };
+        let draw = Draw::new(&sampler, &members, self.target).within(self.support.as_ref());
         let successors = generator.sample_successors(&self.states, &draw)?;
         let pair = (units.put_back(&self.states), units.put_back(&successors));
         let rows = self.models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
@@ -153,7 +152,7 @@ pub fn cycles(
     let step = step_std(target, &units.live);
     let episodes_of = target.episodes().iter().map(|e| e.start..e.end).collect();
     let members = [streams];
-    let draw = Draw { support: support.as_ref(), ..Draw::new(&config.generator.sampler, &members, target) };
+    let draw = Draw::new(&config.generator.sampler, &members, target).within(support.as_ref());
     let states = generator.sample_states(rows, 0.0, &draw)?;
     let bench = Bench {
         target,

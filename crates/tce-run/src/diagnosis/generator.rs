@@ -145,7 +145,7 @@ impl Tried<'_> {
         let step = step_std(training, &units.live);
         let pair = (units.put_back(&states), units.put_back(&successors));
         let at_zero = models.label(&[pair], TerminalHandling::None)?.remove(0).transitions;
-        let (wider_states, wider_successors) = generator.sample_pairs(rows, config.y_max, &Draw { support, ..draw })?;
+        let (wider_states, wider_successors) = generator.sample_pairs(rows, config.y_max, &draw.within(support))?;
         let expanded = finisher.finish(&[(&wider_states, &wider_successors)])?.remove(0).transitions;
         Ok(Quality {
             evaluations: sampler.evaluations(),

@@ -45,7 +45,7 @@ pub use subject::{Options, Subject};
 use work::Work;
 
 /// Changes when the same rows would give other metrics.
-const VERSION: u32 = 6;
+const VERSION: u32 = 7;
 /// With fewer target rows neighbourhoods mean nothing.
 const FEWEST: usize = 100;
 
@@ -148,9 +148,11 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         course.step(part, json!([options, inputs.target.rows.len()]));
     }
     course.plan();
-    let (generator, ..) = networks(inputs, config, seeds, root, device)?;
-    let (models, _, errors) = label_models(inputs, &config.labels, seeds, root, device)?;
-    let finisher = finisher(&generator.units, &models, config, inputs);
+    // The run's own networks have seen no source where it has no use for one; the measures compare with the source in any case.
+    let seen = &*inputs.seen_by(config);
+    let (generator, ..) = networks(seen, config, seeds, root, device)?;
+    let (models, _, errors) = label_models(seen, &config.labels, seeds, root, device)?;
+    let finisher = finisher(&generator.units, &models, config, seen);
     let place = (inputs.agent, inputs.shift);
     let simulator = match place {
         (Some(agent), Some(shift)) if options.simulator => Some((agent, shift)),
@@ -162,8 +164,8 @@ pub fn diagnose(subject: &Subject, options: &Options, root: &Path, device: &Devi
         finisher: &finisher,
         config,
         target: &imitated,
-        support: support(inputs, config),
-        evaluator: filtering_models(inputs, config, root, device)?,
+        support: support(seen, config),
+        evaluator: filtering_models(seen, config, root, device)?,
         seeds,
         member,
         simulator,

@@ -93,8 +93,7 @@ impl Sampler<'_> {
             self.seeds.iter().map(|&s| Streams::new(s).child(&format!("diagnosis/{purpose}"))).collect();
         let Self { generator, config, target, .. } = self;
         let units = &generator.units;
-        let support = self.support.as_ref();
-        let draw = Draw { support, ..Draw::new(&config.generator.sampler, &members, target) };
+        let draw = Draw::new(&config.generator.sampler, &members, target).within(self.support.as_ref());
         let (all, successors) = generator.sample_pairs(rows, y_max, &draw)?;
         let (d, labels) = (units.live.len(), uniform_labels(&members[self.member], "state", rows, y_max));
         let own = self.member * rows * d..(self.member + 1) * rows * d;
@@ -117,8 +116,7 @@ impl Sampler<'_> {
         let mut keep = self.finisher.keep(&s, &s2);
         let rows = self.label(&units.put_back(&s), &units.put_back(&s2))?;
         if let Some(evaluator) = &self.evaluator {
-            let mut possible = vec![false; rows.len()];
-            evaluator.possible(&rows, config.filter.margin).into_iter().for_each(|i| possible[i] = true);
+            let possible = evaluator.possible(&rows, config.filter.margin);
             keep.iter_mut().zip(possible).for_each(|(keep, possible)| *keep &= possible);
         }
         let simulated = match self.simulator {

@@ -21,6 +21,8 @@ pub struct Row {
     pub seed: u64,
     /// Normalised score.
     pub score: Option<f64>,
+    /// Whether its policy could not act to the end; it counts as a random policy.
+    pub diverged: bool,
     /// Where its policy is.
     pub place: PathBuf,
     /// Seconds.
@@ -69,6 +71,7 @@ impl Sweep {
                     method: entry.column(),
                     seed: entry.seed,
                     score: outcome.score,
+                    diverged: outcome.diverged,
                     place: outcome.place,
                     seconds: outcome.seconds,
                     program: outcome.program,

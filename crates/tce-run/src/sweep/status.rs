@@ -117,7 +117,7 @@ impl Sweep {
                 kind.0 += 1;
                 time.0 += outcome.seconds;
                 time.1 += 1;
-                if let Some(score) = outcome.score {
+                if let Some(score) = outcome.counted() {
                     scores.entry((entry.task.to_string(), entry.column())).or_default().push(score);
                 }
                 continue;

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 use tce_base::{FileError, Owner, PROGRAM, read_json, sha256_file, write_json, write_json_first};
 use tce_nn::Device;
+use tce_report::analysis::DIVERGED;
 
 use super::{Entry, Kind, Sweep};
 use crate::augment::{augment_rows, label_models};
@@ -36,6 +37,9 @@ pub struct Outcome {
     pub id: String,
     /// Normalised score, for runs; None without a simulator, or if the policy cannot act.
     pub score: Option<f64>,
+    /// Whether its policy could not act to the end.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub diverged: bool,
     /// Where the result is, in the sweep's folder.
     pub place: PathBuf,
     /// SHA-256 of its files.
@@ -50,6 +54,11 @@ pub struct Outcome {
 }
 
 impl Outcome {
+    /// What the run counts for in a table, as in a report: a policy that diverged is no better than a random one.
+    pub fn counted(&self) -> Option<f64> {
+        self.score.or(self.diverged.then_some(DIVERGED))
+    }
+
     /// Whether two copies of the work have the same result.
     pub fn agrees(&self, other: &Self) -> bool {
         (&self.id, &self.place, &self.files, self.score.map(f64::to_bits))
@@ -217,6 +226,7 @@ impl Sweep {
         let args = self.data(entry);
         let root = &args.out;
         let seeds = &[entry.seed];
+        let mut diverged = false;
         let (score, place, files) = match entry.kind {
             Kind::Source => data_file(&source_file(entry.task, &args, config.source.rows)?)?,
             Kind::Target => data_file(&target_file(entry.task, &args)?)?,
@@ -238,6 +248,7 @@ impl Sweep {
                 let inputs = Inputs::of_config(entry.task, &args, &config)?;
                 let name = entry.column().replace(' ', "-");
                 let summary = run(&name, &inputs, &config, seeds, root, &entry.task.directory(), device)?;
+                diverged = summary.learned.evaluations.first().is_some_and(|e| e.failed.is_some());
                 (summary.scores.first().copied().flatten(), summary.directory.clone(), files_of(&summary.directory)?)
             }
             Kind::Verdict => self.verdict(entry, &config, device)?,
@@ -245,6 +256,7 @@ impl Sweep {
         Ok(Outcome {
             id: entry.id.clone(),
             score,
+            diverged,
             place: place.strip_prefix(&self.directory).unwrap_or(&place).to_owned(),
             files,
             seconds: started.elapsed().as_secs_f64(),
@@ -336,6 +348,7 @@ mod tests {
         let outcome = |score: f64, seconds: f64| Outcome {
             id: entry.id.clone(),
             score: Some(score),
+            diverged: false,
             place: "runs/x".into(),
             files: BTreeMap::new(),
             seconds,
@@ -344,6 +357,11 @@ mod tests {
         };
         assert_eq!(sweep.outcome(entry).unwrap(), None);
         sweep.settle(outcome(1.0, 5.0)).unwrap();
+        let without = |diverged| Outcome { score: None, diverged, ..outcome(1.0, 5.0) };
+        assert_eq!(
+            [outcome(1.0, 5.0), without(true), without(false)].map(|o| o.counted()),
+            [Some(1.0), Some(DIVERGED), None]
+        );
         // The same in another time is the same.
         assert_eq!(sweep.settle(outcome(1.0, 7.0)).unwrap().seconds, 5.0);
         let message = sweep.settle(outcome(2.0, 5.0)).unwrap_err().to_string();

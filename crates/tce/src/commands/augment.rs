@@ -53,7 +53,7 @@ struct Written {
 impl Augment {
     /// Runs the command.
     pub fn run(self, output: Output, device: &Device) -> Result<()> {
-        super::refuse::existing(&self.out, self.writing.force)?;
+        super::refuse::data_set(&self.out, &self.writing)?;
         super::refuse::inputs_as_output(&self.out, &[&self.source, &self.target])?;
         let config = self.config.layered(None, None)?.config()?;
         super::refuse::folder(&self.cache)?;

@@ -5,14 +5,20 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use tce_data::{
-    ActionRange, Agent, Check, EpisodeEnds, Finding, Inspection, LoadOptions, LoadReport, Loaded, Problem, Quality,
-    ScoreTable, Severity, Shift, Transitions, infer_agents, load, read_attributes, reference_scores,
+    Agent, Check, EpisodeEnds, Finding, Inspection, LoadReport, Loaded, ScoreTable, Severity, Transitions,
+    infer_agents, reference_scores,
 };
 use tce_run::error::{Error, Result};
-use tce_run::own::{DataFormat, Own, Writing, range_of};
+use tce_run::own::{Own, range_of};
 use tce_sim::{ReplayReport, replay};
 
 use crate::output::{Output, table};
+
+mod convert;
+mod reading;
+
+use convert::Convert;
+use reading::{named_by_file, read};
 
 /// Look at, check and convert data sets.
 #[derive(Debug, Subcommand)]
@@ -51,54 +57,16 @@ pub struct CheckArgs {
     own: Own,
 }
 
-/// Arguments of `convert`.
-#[derive(Debug, Args)]
-pub struct Convert {
-    /// The file to read.
-    input: PathBuf,
-    /// The file to write.
-    output: PathBuf,
-    #[command(flatten)]
-    writing: Writing,
-    #[command(flatten)]
-    own: Own,
-}
-
-/// Reads a file; where the user does not name its robot, a public file's name does, if the dimensions agree.
-fn read(own: &Own, file: &Path) -> Result<(Own, Loaded)> {
-    read_with(own, file, Own::load_options)
-}
-
-fn read_with(own: &Own, file: &Path, options: impl Fn(&Own) -> LoadOptions) -> Result<(Own, Loaded)> {
-    let named = Own { env: own.env.or_else(|| environment_of(file)), ..own.clone() };
-    match load(file, &options(&named)) {
-        Err(e) if own.env.is_none() && e.problem() == Some(Problem::Dimension) => {
-            Ok((own.clone(), load(file, &options(own))?))
+/// What `one` makes of the files, up to the first on which it fails, and why it does.
+fn each<T>(files: &[PathBuf], one: impl Fn(&Path) -> Result<T>) -> (Vec<T>, Option<Error>) {
+    let mut all = Vec::new();
+    for file in files {
+        match one(file) {
+            Ok(made) => all.push(made),
+            Err(error) => return (all, Some(error)),
         }
-        loaded => Ok((named, loaded?)),
     }
-}
-
-/// The environment that the name of a benchmark's file tells: `ant_gravity_0.5_medium.hdf5`, `hopper_medium-v2.hdf5`,
-/// `hopper-morph-expert-1a2b3c.hdf5`. Somebody's own `hopper.hdf5`, or `antenna.hdf5`, is a robot like any other.
-fn environment_of(path: &Path) -> Option<(Agent, Shift)> {
-    let name = path.file_stem()?.to_str()?;
-    let agent = Agent::ALL.into_iter().find(|a| name.starts_with(a.name()))?;
-    let rest = name[agent.name().len()..].strip_prefix(['-', '_'])?;
-    let shifts = [Shift::Gravity5, Shift::Gravity, Shift::Morph, Shift::Kinematic, Shift::Source];
-    let shift = shifts.into_iter().find_map(|s| {
-        let tail = [s.file_name(), s.name()].into_iter().find_map(|n| rest.strip_prefix(n)?.strip_prefix(['-', '_']));
-        tail.map(|tail| (s, tail))
-    });
-    let (shift, tail) = shift.unwrap_or((Shift::Source, rest));
-    // What may follow the quality: D4RL's version, and the hash that our collector appends.
-    let tail = tail.replace('_', "-");
-    let hex = |t: &str| t.len() >= 6 && t.bytes().all(|b| b.is_ascii_hexdigit());
-    let tail = tail.rsplit_once('-').filter(|(_, end)| hex(end)).map_or(tail.as_str(), |(start, _)| start);
-    let version = |t: &str| t.strip_prefix('v').is_some_and(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()));
-    let tail = tail.rsplit_once('-').filter(|(_, end)| version(end)).map_or(tail, |(start, _)| start);
-    let known = tail == "random" || Quality::ALL.into_iter().any(|q| q.name() == tail);
-    known.then_some((agent, shift))
+    (all, None)
 }
 
 impl Data {
@@ -116,87 +84,99 @@ impl Data {
 struct Inspected {
     load: LoadReport,
     environment: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    note: Option<String>,
     looks_like: Vec<Agent>,
     normalised_score: Option<f64>,
     content: Inspection,
 }
 
 impl Inspect {
+    fn one(&self, file: &Path) -> Result<Inspected> {
+        let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
+        let content = tce_data::inspect(&transitions, own.limit());
+        let reference = own.env.and_then(|(a, s)| reference_scores(a, s, ScoreTable::default()));
+        Ok(Inspected {
+            load: report,
+            environment: own.env.map(|(a, s)| format!("{a}-{s}")),
+            note: named_by_file(&self.own, &own),
+            looks_like: infer_agents(&transitions),
+            normalised_score: content.normalised_score(reference),
+            content,
+        })
+    }
+
     fn run(self, output: Output) -> Result<()> {
-        let mut all = Vec::new();
-        for file in &self.files {
-            let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
-            let content = tce_data::inspect(&transitions, own.limit());
-            let environment = own.env;
-            let reference = environment.and_then(|(a, s)| reference_scores(a, s, ScoreTable::default()));
-            all.push(Inspected {
-                load: report,
-                environment: environment.map(|(a, s)| format!("{a}-{s}")),
-                looks_like: infer_agents(&transitions),
-                normalised_score: content.normalised_score(reference),
-                content,
-            });
+        let (all, failed) = each(&self.files, |file| self.one(file));
+        // One file that cannot be read does not hide what was read before it.
+        if !all.is_empty() {
+            output.print(&all, |all| render_inspected(all, self.dimensions));
         }
-        output.print(&all, |all| {
-            let rows = all.iter().map(|i| {
-                let c = &i.content;
+        failed.map_or(Ok(()), Err)
+    }
+}
+
+/// One line a file, what is to be told of it, and, if wanted, its dimensions.
+fn render_inspected(all: &[Inspected], dimensions: bool) -> String {
+    let rows = all.iter().map(|i| {
+        let c = &i.content;
+        [
+            i.load.file.file_name().map_or(String::new(), |n| n.to_string_lossy().into_owned()),
+            i.load.layout.to_string(),
+            c.rows.to_string(),
+            i.load.dropped.total().to_string(),
+            format!("{}x{}", c.obs_dim, c.act_dim),
+            c.episodes.to_string(),
+            c.terminals.to_string(),
+            format!("{:.0}", c.lengths.mean),
+            format!("{:.1} ± {:.1}", c.returns.mean, c.returns.std),
+            format!("{:.1}", c.returns.min),
+            format!("{:.1}", c.returns.max),
+            i.normalised_score.map_or("-".into(), |s| format!("{s:.1}")),
+            c.observations.dead.len().to_string(),
+            (c.observations.nan + c.actions.nan + c.rewards.nan).to_string(),
+        ]
+    });
+    let header = [
+        "file",
+        "layout",
+        "rows",
+        "dropped",
+        "dims",
+        "episodes",
+        "terminals",
+        "length",
+        "return",
+        "min",
+        "max",
+        "score",
+        "dead",
+        "NaN",
+    ];
+    let mut text = table(&header, rows);
+    for i in all {
+        text.extend(i.note.iter().map(|note| format!("\nnote: {}: {note}\n", i.load.file.display())));
+    }
+    for i in all.iter().filter(|_| dimensions) {
+        let dims = |name: &str, d: &tce_data::DimensionSummary| {
+            let rows = (0..d.mean.len()).map(|k| {
                 [
-                    i.load.file.file_name().map_or(String::new(), |n| n.to_string_lossy().into_owned()),
-                    i.load.layout.to_string(),
-                    c.rows.to_string(),
-                    i.load.dropped.total().to_string(),
-                    format!("{}x{}", c.obs_dim, c.act_dim),
-                    c.episodes.to_string(),
-                    c.terminals.to_string(),
-                    format!("{:.0}", c.lengths.mean),
-                    format!("{:.1} ± {:.1}", c.returns.mean, c.returns.std),
-                    format!("{:.1}", c.returns.min),
-                    format!("{:.1}", c.returns.max),
-                    i.normalised_score.map_or("-".into(), |s| format!("{s:.1}")),
-                    c.observations.dead.len().to_string(),
-                    (c.observations.nan + c.actions.nan + c.rewards.nan).to_string(),
+                    format!("{name}[{k}]"),
+                    format!("{:.4}", d.mean[k]),
+                    format!("{:.4}", d.std[k]),
+                    format!("{:.4}", d.min[k]),
+                    format!("{:.4}", d.max[k]),
                 ]
             });
-            let header = [
-                "file",
-                "layout",
-                "rows",
-                "dropped",
-                "dims",
-                "episodes",
-                "terminals",
-                "length",
-                "return",
-                "min",
-                "max",
-                "score",
-                "dead",
-                "NaN",
-            ];
-            let mut text = table(&header, rows);
-            for i in all.iter().filter(|_| self.dimensions) {
-                let dims = |name: &str, d: &tce_data::DimensionSummary| {
-                    let rows = (0..d.mean.len()).map(|k| {
-                        [
-                            format!("{name}[{k}]"),
-                            format!("{:.4}", d.mean[k]),
-                            format!("{:.4}", d.std[k]),
-                            format!("{:.4}", d.min[k]),
-                            format!("{:.4}", d.max[k]),
-                        ]
-                    });
-                    table(&["dimension", "mean", "std", "min", "max"], rows)
-                };
-                text += &format!("\n{}\n", i.load);
-                text += &dims("s", &i.content.observations);
-                text += "\n";
-                text += &dims("a", &i.content.actions);
-                text += "\n";
-            }
-            text
-        });
-        Ok(())
+            table(&["dimension", "mean", "std", "min", "max"], rows)
+        };
+        text += &format!("\n{}\n", i.load);
+        text += &dims("s", &i.content.observations);
+        text += "\n";
+        text += &dims("a", &i.content.actions);
+        text += "\n";
     }
+    text
 }
 
 #[derive(Serialize)]
@@ -248,40 +228,50 @@ impl Uses {
 }
 
 impl CheckArgs {
+    fn one(&self, file: &Path) -> Result<Checked> {
+        let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
+        let environment = own.env;
+        let mut check = tce_data::check(&transitions, own.agent());
+        if let Some(message) = named_by_file(&self.own, &own) {
+            check.findings.push(Finding { severity: Severity::Note, field: "robot", message });
+        }
+        if let Some(given) = &own.action_range {
+            let range = range_of(given, transitions.act_dim, file).map_err(Error::Usage)?;
+            let message = match range.outside(&transitions.actions) {
+                0 => format!("taken as {range} (--action-range)"),
+                n => format!("taken as {range} (--action-range); {n} values lie outside"),
+            };
+            check.findings.push(Finding { severity: Severity::Note, field: "actions", message });
+        }
+        let replay = match (self.replay, environment) {
+            (false, _) => None,
+            (true, Some((agent, shift))) => Some(replay(agent, shift, &transitions, None)?),
+            (true, None) => {
+                return Err(Error::Usage(format!(
+                    "{}: the file's name does not tell its environment; say it with --env, as in --env hopper-morph",
+                    file.display()
+                )));
+            }
+        };
+        let passes = check.is_ok() && replay.as_ref().is_none_or(ReplayReport::passes);
+        let environment = environment.map(|(a, s)| format!("{a}-{s}"));
+        let uses = Uses::of(&transitions, &report, own.agent());
+        let content = tce_data::inspect(&transitions, own.limit());
+        Ok(Checked { load: report, environment, content, uses, check, replay, passes })
+    }
+
     fn run(self, output: Output) -> Result<()> {
         if self.replay {
             tce_sim::open_library()?;
         }
-        let mut all = Vec::new();
-        for file in &self.files {
-            let (own, Loaded { transitions, report, .. }) = read(&self.own, file)?;
-            let environment = own.env;
-            let mut check = tce_data::check(&transitions, own.agent());
-            if let Some(given) = &own.action_range {
-                let range = range_of(given, transitions.act_dim, file).map_err(Error::Usage)?;
-                let message = match range.outside(&transitions.actions) {
-                    0 => format!("taken as {range} (--action-range)"),
-                    n => format!("taken as {range} (--action-range); {n} values lie outside"),
-                };
-                check.findings.push(Finding { severity: Severity::Note, field: "actions", message });
-            }
-            let replay = match (self.replay, environment) {
-                (false, _) => None,
-                (true, Some((agent, shift))) => Some(replay(agent, shift, &transitions, None)?),
-                (true, None) => {
-                    return Err(Error::Usage(format!(
-                        "{}: the file's name does not tell its environment; say it with --env, as in --env hopper-morph",
-                        file.display()
-                    )));
-                }
-            };
-            let passes = check.is_ok() && replay.as_ref().is_none_or(ReplayReport::passes);
-            let environment = environment.map(|(a, s)| format!("{a}-{s}"));
-            let uses = Uses::of(&transitions, &report, own.agent());
-            let content = tce_data::inspect(&transitions, own.limit());
-            all.push(Checked { load: report, environment, content, uses, check, replay, passes });
+        let (all, failed) = each(&self.files, |file| self.one(file));
+        // One file that cannot be read does not hide what was read before it.
+        if !all.is_empty() {
+            output.print(&all, |all| render_checks(all));
         }
-        output.print(&all, |all| render_checks(all));
+        if let Some(error) = failed {
+            return Err(error);
+        }
         match all.iter().filter(|c| !c.passes).count() {
             0 => Ok(()),
             n => Err(Error::Failed(format!("{n} of {} data sets do not pass", all.len()))),
@@ -373,60 +363,4 @@ fn render_checks(all: &[Checked]) -> String {
         text += &table(&header, rows);
     }
     text
-}
-
-impl Convert {
-    fn run(self, output: Output) -> Result<()> {
-        super::refuse::existing(&self.output, self.writing.force)?;
-        let options = |own: &Own| LoadOptions { all_columns: true, ..own.load_options() };
-        let Loaded { transitions, columns, mut report } = read_with(&self.own, &self.input, options)?.1;
-        let kept: Vec<(&str, &[f32])> =
-            columns.iter().map(|(name, values)| (name.as_str(), values.as_slice())).collect();
-        if self.writing.format == DataFormat::Minari && !kept.is_empty() {
-            let names: Vec<&str> = kept.iter().map(|(name, _)| *name).collect();
-            report
-                .warnings
-                .push(format!("Minari has no place for these columns, which are left out: {}", names.join(", ")));
-        }
-        let mut attributes = read_attributes(&self.input)?;
-        let origin = if attributes.contains_key("origin") { "converted_from" } else { "origin" };
-        attributes.insert(origin.into(), report.to_string());
-        if self.writing.format == DataFormat::Minari && report.unknown_successors > 0 {
-            report.warnings.push(format!(
-                "the last observation of {} episodes is not known and repeats the one before; Minari has no mark for that",
-                report.unknown_successors
-            ));
-        }
-        let range = ActionRange::of(&[&transitions]);
-        self.writing.write(&self.output, &transitions, range.as_ref(), &attributes, &kept)?;
-        output.print(&report, |r| format!("{r}\nwritten to {}", self.output.display()));
-        Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn file_names_tell_environments() {
-        let env = |name: &str| environment_of(Path::new(name));
-        assert_eq!(env("/x/ant_gravity_0.5_medium.hdf5"), Some((Agent::Ant, Shift::Gravity)));
-        assert_eq!(env("hopper_morph_expert.hdf5"), Some((Agent::Hopper, Shift::Morph)));
-        assert_eq!(env("halfcheetah_medium-v2.hdf5"), Some((Agent::HalfCheetah, Shift::Source)));
-        assert_eq!(env("ant_gravity_5.0_medium.hdf5"), Some((Agent::Ant, Shift::Gravity5)));
-        assert_eq!(env("hopper-source-medium-5264d44bffc4.hdf5"), Some((Agent::Hopper, Shift::Source)));
-        assert_eq!(env("walker2d_kinematic_medium_expert.hdf5"), Some((Agent::Walker2d, Shift::Kinematic)));
-        for own in [
-            "mine.hdf5",
-            "hopper.hdf5",
-            "antenna_medium.hdf5",
-            "hopper_lab_day3.hdf5",
-            "ant.hdf5",
-            "hopper_expert_run2.hdf5",
-            "hopper_random_walk.hdf5",
-        ] {
-            assert_eq!(env(own), None, "{own}");
-        }
-    }
 }

@@ -1,18 +1,18 @@
 //! `tce learn`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use tce_base::plus_minus;
 use tce_learn::{About, LearnedRows};
 use tce_nn::Device;
 use tce_run::config::Algorithm;
-use tce_run::error::Result;
+use tce_run::error::{Error, Result};
 use tce_run::inputs::Inputs;
 use tce_run::layers::ConfigArgs;
 use tce_run::own::Own;
 use tce_run::pipeline::seeds;
-use tce_run::training_run::{Comparison, Trained, TrainingRun, ensure_fits};
+use tce_run::training_run::{Comparison, Trained, TrainingRun, ensure_fits, ensure_own_folder};
 
 use crate::estimates::{Estimated, estimates};
 use crate::output::{Output, list as listed, table};
@@ -70,6 +70,8 @@ impl Learn {
         let seeds = seeds(self.seed, self.seeds)?;
         ensure_fits(&config.learner, LearnedRows::with(self.extra.as_ref()))?;
         super::refuse::folder(&out)?;
+        self.config.config.as_deref().map_or(Ok(()), |config| ensure_config_stays(config, &out))?;
+        ensure_own_folder(&out)?;
         // Everything is read before anything is computed: a file that does not fit is no surprise after hours.
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target, self.extra.as_deref(), &self.own)?;
@@ -78,6 +80,20 @@ impl Learn {
         let run = TrainingRun { config: &config, seeds: &seeds, own: &self.own, comparison, out: &out };
         output.print(&run.run(&inputs, device)?, render);
         Ok(())
+    }
+}
+
+/// Refuses the file of `--config` in the place of the settings that the training writes.
+fn ensure_config_stays(config: &Path, out: &Path) -> Result<()> {
+    let written = out.join("config.toml");
+    match super::refuse::is_same(&written, config) {
+        true => Err(Error::Usage(format!(
+            "--config {}: found the file in which this training writes all of its settings, expected another one; choose another --out \
+             than {}, or copy the file",
+            config.display(),
+            out.display()
+        ))),
+        false => Ok(()),
     }
 }
 
@@ -104,7 +120,7 @@ fn render(report: &Trained) -> String {
             text += &format!("\nDIVERGED: seed {seed}: {} not finite at the end", names.join(", "));
         }
     }
-    // A single policy is taken without being tried.
+    // A single policy is taken without being tried, and so is a baseline where rewards tell nothing.
     if let Some(kept) = report.verdict.as_ref().filter(|kept| !kept.verdict.tried.is_empty()) {
         let rows = kept.verdict.tried.iter().map(|t| Estimated {
             policy: if t.baseline { format!("{} (baseline)", t.name) } else { t.name.clone() },

@@ -116,7 +116,7 @@ impl Run {
         let (source, target) = inputs.behaviour(configs[0].evaluation.scores);
         let scored = |row: &Row| {
             let role = if row.baseline { Role::Baseline } else { Role::Method };
-            Scored::new(&row.title, role, &row.summary.scores.iter().flatten().copied().collect::<Vec<_>>())
+            Scored::new(&row.title, role, &row.summary.counted())
         };
         let recommended = verdict.as_ref().map(|v| v.verdict.method.as_str());
         let scored: Vec<_> = rows.iter().map(scored).collect();
@@ -136,7 +136,7 @@ impl Run {
             course.training(variant.name(), config, config.mixture.learned_rows());
         }
         if !self.no_verdict {
-            course.verdict(&configs[0]);
+            course.verdict(&configs[0], configs.len() * seeds);
         }
         course.plan();
     }
@@ -162,7 +162,7 @@ fn render(report: &Report) -> String {
             .filter(|e| e.failed.is_none())
             .map(|e| e.returns.iter().sum::<f64>() / e.returns.len() as f64)
             .collect();
-        let scores: Vec<f64> = r.summary.scores.iter().flatten().copied().collect();
+        let scores = r.summary.counted();
         let seeds = r.summary.seeds.len();
         let failed = r.summary.learned.evaluations.iter().filter(|e| e.failed.is_some()).count();
         [

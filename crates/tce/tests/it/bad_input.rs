@@ -121,6 +121,42 @@ fn options_that_would_do_something_else_are_refused() {
     assert!(!dir.join("out").exists() && !dir.join("runs").exists(), "before any work");
 }
 
+/// The settings that a training writes never take the place of the user's.
+#[test]
+fn settings_of_the_users_own_are_not_replaced() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    data_pair(dir, Agent::Hopper, Shift::Morph);
+    let (config, text) = (dir.join("out/config.toml"), "[learner]\nsteps = 5\n");
+    fs::create_dir(dir.join("out")).unwrap();
+    fs::write(&config, text).unwrap();
+    let refused = |more: &[&str], words: &str| {
+        let before = crate::common::files(dir);
+        let output = tce(dir, &[&["learn", "--target", "target.hdf5", "--out", "out"], more].concat());
+        assert_eq!(output.status.code(), Some(2), "{}", message(&output));
+        assert!(message(&output).contains(words), "{}", message(&output));
+        assert_eq!(crate::common::files(dir), before);
+        assert_eq!(fs::read_to_string(&config).unwrap(), text);
+    };
+    refused(&[], "out/config.toml: found a file that no training wrote");
+    refused(&["--config", "out/config.toml"], "--config out/config.toml: found the file in which this training writes");
+    // The folder of a training is none for a copy of its settings.
+    fs::write(dir.join("out/spec.json"), "{}").unwrap();
+    refused(&["--config", "./out/config.toml"], "choose another --out than out, or copy the file");
+}
+
+#[test]
+fn nothing_to_generate_is_told_before_any_training() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    data_pair(dir, Agent::Hopper, Shift::Morph);
+    let sets = ["--set", "generator.rows=0", "--set", "mixture.lambda=0.9999"];
+    let (code, message) = augment(dir, "source.hdf5", "target.hdf5", &sets);
+    assert_eq!(code, 2, "{message}");
+    assert!(message.contains("found none of 1500 at mixture.lambda = 0.9999"), "{message}");
+    assert!(!dir.join("runs/stages").exists(), "nothing is trained");
+}
+
 /// On a file system of a few pages the output does not fit: one message, exit code 1, nothing left behind.
 #[test]
 fn a_full_disk_leaves_nothing_behind() {

@@ -214,6 +214,23 @@ fn networks_of_every_cycle_are_measured() {
     assert_eq!(tce_json(dir.path(), &[&args[..], &["--threads", "2"]].concat()), found);
 }
 
+/// A diagnosis is of the run's own networks, also where they have not seen the source rows that it compares with.
+#[test]
+fn a_run_that_does_not_see_the_source_is_diagnosed_with_its_own_networks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let data = ["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()];
+    let run = finished(dir.path(), &data, &["--variant", "simple-aug", "--no-baselines", "--out", "out"]);
+    let place = run["rows"][0]["directory"].as_str().unwrap();
+    let found = tce_json(dir.path(), &[&["diagnose", place][..], &data, FEW].concat());
+    assert!(at(&found, 0.0)["coverage"]["source"].is_number(), "{found}");
+    let stages = fs::read_dir(dir.path().join("out/stages")).unwrap().map(|e| e.unwrap().file_name());
+    let stages: Vec<String> = stages.map(|name| name.into_string().unwrap()).collect();
+    for kind in ["networks-", "labels-"] {
+        assert_eq!(stages.iter().filter(|s| s.starts_with(kind)).count(), 1, "{kind} of the run alone: {stages:?}");
+    }
+}
+
 /// One of two seeds is looked at, and not the other.
 #[test]
 fn the_seed_asked_for_is_the_one_that_is_measured() {

@@ -301,6 +301,188 @@ fn rows_of_augment_are_not_learned_from_twice() {
     assert!(!message(&generated).contains("left out"), "{}", message(&generated));
     let policy = |out: &str| std::fs::read(dir.join(out).join("policy-seed0.safetensors")).unwrap();
     assert!(policy("whole") == policy("generated") && policy("whole") == policy("plain"));
+    // The column counts where the numbers tell nothing, too.
+    let args = ["learn", "--target", "source.hdf5", "--extra", "out.hdf5", "--out", "other", "--no-verdict"];
+    let other = tce(dir, &[&args[..], TINY].concat());
+    assert!(message(&other).contains(&words), "{}", message(&other));
+}
+
+/// A column of that name in a file that `augment` did not write says nothing of target rows.
+#[test]
+fn a_column_origin_of_the_users_own_drops_no_rows() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let extra = arm(3, 2, (4, 60), 1.0, 1);
+    let origin: Vec<f32> = (0..extra.len()).map(|i| (i % 3) as f32).collect();
+    pair(dir, &extra, &arm(3, 2, (2, 40), 1.0, 2));
+    save_d4rl(&dir.join("named.hdf5"), &extra, &BTreeMap::new(), &[("origin", &origin)]).unwrap();
+    let learn = |extra: &str, out: &str| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", extra, "--out", out, "--no-verdict"];
+        let output = tce(dir, &[&args[..], TINY].concat());
+        assert!(output.status.success() && !message(&output).contains("left out"), "{}", message(&output));
+        std::fs::read(dir.join(out).join("policy-seed0.safetensors")).unwrap()
+    };
+    assert!(learn("named.hdf5", "named") == learn("source.hdf5", "plain"));
+}
+
+/// A data set is replaced by a data set of the same layout and by nothing else, and no input by what is made of it.
+#[test]
+fn what_is_there_is_spared() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    pair(dir, &arm(3, 2, (4, 60), 1.0, 1), &arm(3, 2, (2, 40), 1.0, 2));
+    std::fs::create_dir_all(dir.join("proj/data")).unwrap();
+    std::fs::copy(dir.join("target.hdf5"), dir.join("proj/data/raw.hdf5")).unwrap();
+    std::fs::write(dir.join("proj/data/notes.txt"), "mine").unwrap();
+    let convert =
+        |input: &str, output: &str, more: &[&str]| tce(dir, &[&["data", "convert", input, output], more].concat());
+    let minari = ["--format", "minari", "--force"];
+    assert!(convert("target.hdf5", "arm-v0", &minari).status.success());
+    let augment = |target: &str, out: &str, more: &[&str]| {
+        tce(dir, &[&["augment", "--source", "source.hdf5", "--target", target, "--out", out], more].concat())
+    };
+    let contents = || -> Vec<_> {
+        crate::common::files(dir).into_iter().map(|file| (std::fs::read(&file).unwrap(), file)).collect()
+    };
+    let (before, main) = (contents(), "arm-v0/data/main_data.hdf5");
+    for (output, words) in [
+        (convert("proj/data/raw.hdf5", "proj", &minari), "proj/data: field `file`: found notes.txt in it"),
+        (convert("target.hdf5", "target.hdf5", &["--force"]), "found one of the inputs"),
+        (convert("target.hdf5", "./target.hdf5", &[]), "found one of the inputs"),
+        (convert(main, "arm-v0", &minari), "found one of the inputs"),
+        (augment(main, "arm-v0", &minari), "found one of the inputs"),
+        (convert("target.hdf5", "proj", &["--force"]), "proj: field `file`: found a folder"),
+        (augment("target.hdf5", "proj", &["--force"]), "proj: field `file`: found a folder"),
+        (convert("source.hdf5", "target.hdf5", &minari), "target.hdf5: field `file`: found a file"),
+        (augment("target.hdf5", "proj/data/notes.txt", &minari), "notes.txt: field `file`: found a file"),
+    ] {
+        assert_eq!(output.status.code(), Some(2), "{words}: {}", message(&output));
+        assert!(message(&output).contains(words), "{words}: {}", message(&output));
+    }
+    assert!(contents() == before);
+    assert!(convert("source.hdf5", "arm-v0", &minari).status.success());
+    assert_eq!(load(&dir.join("arm-v0"), &LoadOptions::default()).unwrap().transitions.len(), 240);
+    for (folder, entries) in [("arm-v0", 1), ("arm-v0/data", 2)] {
+        assert_eq!(std::fs::read_dir(dir.join(folder)).unwrap().count(), entries, "{folder}: nothing is left behind");
+    }
+}
+
+#[test]
+fn minari_gets_the_range_of_actions_that_the_user_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    save(dir, "arm.hdf5", &arm(11, 3, (2, 40), 20.0, 1));
+    for (out, more, low, outside) in [
+        ("both-v0", &["--action-range", "-25:25", "--env", "hopper-morph"][..], "[-25.0, -25.0, -25.0]", false),
+        ("given-v0", &["--action-range", "-25:25"], "[-25.0, -25.0, -25.0]", false),
+        ("robot-v0", &["--env", "hopper-morph"], "[-1.0, -1.0, -1.0]", true),
+    ] {
+        let output = tce(dir, &[&["data", "convert", "arm.hdf5", out, "--format", "minari"], more].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        let metadata = std::fs::read_to_string(dir.join(out).join("data/metadata.json")).unwrap();
+        assert!(metadata.contains(low), "{out}: {metadata}");
+        let told = String::from_utf8_lossy(&output.stdout).contains("action values lie outside of -1:1");
+        assert_eq!(told, outside, "{out}");
+    }
+}
+
+/// What was removed or damaged is made again, and nothing else is.
+#[test]
+fn a_finished_training_without_its_files_is_not_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    pair(dir, &arm(3, 2, (4, 60), 1.0, 1), &arm(3, 2, (2, 40), 1.0, 2));
+    let learn = |more: &[&str]| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", "source.hdf5", "--out", "out"];
+        let few = ["--set=learner.steps=10", "--set=learner.bc.ensemble=2", "--set=fitted_q.steps=0"];
+        let output = tce(dir, &[&args[..], TINY, &few, more].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        message(&output)
+    };
+    learn(&[]);
+    let out = |file: &str| dir.join("out").join(file);
+    let read = || {
+        let files =
+            ["policy.safetensors", "policy-seed0.safetensors", "baseline/policy-seed0.safetensors", "verdict.json"];
+        files.map(|file| std::fs::read(out(file)).unwrap())
+    };
+    let whole = read();
+    let remove = |file: &str| std::fs::remove_file(out(file)).unwrap();
+    let cut = |file: &str| std::fs::write(out(file), &std::fs::read(out(file)).unwrap()[..100]).unwrap();
+    let damages: [(&dyn Fn(), usize); 5] = [
+        (&|| remove("policy.safetensors"), 2),
+        (&|| cut("policy.safetensors"), 2),
+        (&|| remove("verdict.json"), 2),
+        (&|| cut("policy-seed0.safetensors"), 1),
+        (&|| std::fs::remove_dir_all(out("baseline")).unwrap(), 1),
+    ];
+    for (k, (damage, kept)) in damages.into_iter().enumerate() {
+        assert!(learn(&[]).contains("done before"), "before damage {k}");
+        damage();
+        let told = learn(&[]);
+        assert!(told.contains("are missing or were changed") && !told.contains("done before"), "{k}: {told}");
+        assert_eq!(told.matches("learned before").count(), kept, "{k}: {told}");
+        assert!(read() == whole, "damage {k}");
+    }
+    // Whoever wants no verdict needs the policies alone.
+    remove("policy.safetensors");
+    assert!(learn(&["--no-verdict"]).contains("done before"));
+    assert!(!learn(&[]).contains("done before") && read() == whole);
+}
+
+/// Where all rewards are equal, a model of them predicts noise: that must not choose a policy.
+#[test]
+fn rewards_that_are_all_equal_decide_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let mut target = arm(3, 2, (2, 40), 1.0, 2);
+    target.rewards.fill(0.0);
+    (target.terminals[39], target.timeouts[39]) = (true, false);
+    pair(dir, &arm(3, 2, (4, 60), 1.0, 1), &target);
+    let learn = |out: &str| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", "source.hdf5", "--out", out];
+        let output = tce(dir, &[&args[..], TINY].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    let told = learn("zeros");
+    for words in ["the target's rewards are all equal (0)", "do not tell for sure", "zeros/policy.safetensors"] {
+        assert!(told.contains(words), "no {words:?} in:\n{told}");
+    }
+    let file = |name: &str| std::fs::read(dir.join("zeros").join(name)).unwrap();
+    assert!(file("policy.safetensors") == file("baseline/policy-seed0.safetensors"));
+    assert!(!told.contains("imagined return") && !dir.join("zeros/stages").exists(), "nothing is tried:\n{told}");
+    // A reward for every step until the end of the robot counts the steps.
+    target.rewards.fill(1.0);
+    save(dir, "target.hdf5", &target);
+    assert!(learn("steps").contains("imagined return"));
+}
+
+#[test]
+fn messages_name_the_file_and_what_it_is_taken_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    save(dir, "arm.hdf5", &arm(3, 2, (2, 40), 1.0, 1));
+    save(dir, "other.hdf5", &arm(4, 2, (2, 40), 1.0, 2));
+    save(dir, "hopper_morph_expert.hdf5", &arm(11, 3, (2, 40), 1.0, 3));
+    for command in ["check", "inspect"] {
+        // What could be read is told, whatever comes after it.
+        let output = tce(dir, &["data", command, "arm.hdf5", "missing.hdf5"]);
+        assert_eq!(output.status.code(), Some(1), "{}", message(&output));
+        assert!(String::from_utf8_lossy(&output.stdout).contains("arm.hdf5"), "{command}");
+        assert!(message(&output).contains("missing.hdf5: cannot open"), "{}", message(&output));
+        let named = |more: &[&str]| {
+            let output = tce(dir, &[&["data", command, "hopper_morph_expert.hdf5"], more].concat());
+            String::from_utf8_lossy(&output.stdout).contains("taken for hopper-morph, as the file's name says")
+        };
+        assert!(named(&[]) && !named(&["--env", "hopper-morph"]), "{command}");
+    }
+    let output = tce(dir, &["learn", "--target", "arm.hdf5", "--extra", "other.hdf5", "--out", "out"]);
+    assert_eq!(output.status.code(), Some(1), "{}", message(&output));
+    let words =
+        "other.hdf5: found extra rows of 4 observations and 2 actions, expected 3 and 2 as in the target, arm.hdf5";
+    assert!(message(&output).contains(words), "{}", message(&output));
+    assert!(!dir.join("out").exists());
 }
 
 /// Nobody can roll out a robot that has no simulator: what learned dynamics tell of the policy stands in the table instead.

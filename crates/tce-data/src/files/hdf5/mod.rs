@@ -1,9 +1,10 @@
 //! Reads numbers from HDF5 files of unknown origin.
 //!
-//! `hdf5-pure` reads the data sets. The rest is done here: links are followed ([`names`]), newer layout messages are
-//! rewritten for the library ([`modern`]), missing data are detected before memory is allocated ([`storage`]), and
-//! numbers that float32 cannot hold are reported ([`numbers`]).
+//! `hdf5-pure` reads the data sets. The rest is done here: links are followed ([`names`]), groups are opened once
+//! ([`groups`]), newer layout messages are rewritten for the library ([`modern`]), missing data are detected before
+//! memory is allocated ([`storage`]), and numbers that float32 cannot hold are reported ([`numbers`]).
 
+mod groups;
 mod heap;
 mod image;
 mod modern;
@@ -22,8 +23,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use hdf5_pure::{AttrValue, Dataset, Datatype, File, FormatError};
 use tce_base::{FileError, file_inside};
 
+use self::groups::Groups;
 use self::names::{Broken, Found, Names};
 use self::storage::Unwritten;
+use super::rounding;
 use crate::{DataError, Problem};
 
 const REPAIR: &str = "The file is damaged or incomplete: fetch or write it again";
@@ -37,6 +40,7 @@ pub(super) struct Hdf5 {
     bytes: u64,
     file: File,
     names: Names,
+    groups: Groups,
     notes: Arc<Mutex<Vec<String>>>,
 }
 
@@ -47,19 +51,28 @@ pub(super) struct Column {
     pub dim: usize,
     /// Whether numbers were stored as f64 and have been rounded.
     pub rounded: bool,
+    /// Of each column, what the rounding lost: see [`rounding::losses`].
+    pub losses: Vec<f32>,
+}
+
+/// A field that was read before: a vector beside it has as many rows.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) struct Beside<'a> {
+    pub field: &'a str,
+    pub rows: usize,
 }
 
 /// The expected form of a field.
 #[derive(Clone, Copy)]
-enum Kind {
+enum Kind<'a> {
     /// (N, D), D >= 1. The data must have been written.
     Matrix,
     /// Like `Matrix`, but numbers may be NaN or infinite.
     Gaps,
     /// (N, D) or (N,). The data must have been written.
     Table,
-    /// (N,) or (N, 1). Data that were never written are read as the fill value.
-    Vector,
+    /// (N,) or (N, 1). Data that were never written are read as the fill value, if there are as many as beside it.
+    Vector(Beside<'a>),
 }
 
 impl Hdf5 {
@@ -98,7 +111,7 @@ impl Hdf5 {
             return Err(whole(Problem::Truncated, format!("{bytes} of {end} bytes"), REPAIR));
         }
         let names = Names::open(path, bytes, superblock).map_err(|e| unreadable(path, "file", e))?;
-        Ok(Self { path: path.to_owned(), bytes, file, names, notes })
+        Ok(Self { path: path.to_owned(), bytes, file, names, groups: Groups::default(), notes })
     }
 
     /// The names in the group at `path` (empty: the top level); `None` if it is not a group.
@@ -156,14 +169,14 @@ impl Hdf5 {
         self.read(name, Kind::Table)
     }
 
-    /// Reads a vector: shape (N,) or (N, 1).
-    pub fn vector(&self, name: &str) -> Result<Column, DataError> {
-        self.read(name, Kind::Vector)
+    /// Reads a vector: shape (N,) or (N, 1). Only one that was never written is compared with `beside`.
+    pub fn vector(&self, name: &str, beside: Beside<'_>) -> Result<Column, DataError> {
+        self.read(name, Kind::Vector(beside))
     }
 
     /// Reads a vector of 0 and 1, stored as any number type.
-    pub fn flags(&self, name: &str) -> Result<Vec<bool>, DataError> {
-        let column = self.vector(name)?;
+    pub fn flags(&self, name: &str, beside: Beside<'_>) -> Result<Vec<bool>, DataError> {
+        let column = self.vector(name, beside)?;
         if let Some(row) = column.data.iter().position(|&x| x != 0.0 && x != 1.0) {
             let found = format!("{} in row {row}", column.data[row]);
             return Err(self.invalid(Problem::Value, name, found, "0 or 1", "Store flags as 0 and 1"));
@@ -224,8 +237,11 @@ impl Hdf5 {
         let patch = self.names.readable_layout(header).map_err(|e| unreadable(&self.path, name, e))?;
         let shown =
             patch.map(|patch| guard(&self.path, name, || modern::open(&self.path, self.bytes, patch))).transpose()?;
-        let file = shown.as_ref().unwrap_or(&self.file);
-        guard(&self.path, name, || match file.dataset(&path) {
+        let open = || match &shown {
+            Some(file) => file.dataset(&path),
+            None => self.groups.dataset(&self.file, &path),
+        };
+        guard(&self.path, name, || match open() {
             Err(hdf5_pure::Error::NotADataset(what)) => Ok(Err(other(what))),
             opened => opened.map(Ok),
         })?
@@ -244,7 +260,7 @@ impl Hdf5 {
         self.invalid(Problem::MissingField, name, found, "a data set of this name", advice)
     }
 
-    fn read(&self, name: &str, kind: Kind) -> Result<Column, DataError> {
+    fn read(&self, name: &str, kind: Kind<'_>) -> Result<Column, DataError> {
         let dataset = self.open_dataset(name)?;
         let (shape, datatype) = guard(&self.path, name, || Ok((dataset.shape()?, dataset.datatype()?)))?;
         if !numbers::is_number(&datatype) {
@@ -254,12 +270,12 @@ impl Hdf5 {
         }
         let (rows, dim) = match (kind, &shape[..]) {
             (Kind::Matrix | Kind::Gaps | Kind::Table, &[n, d]) if d > 0 => (n, d),
-            (Kind::Table, &[n]) | (Kind::Vector, &[n] | &[n, 1]) => (n, 1),
+            (Kind::Table, &[n]) | (Kind::Vector(_), &[n] | &[n, 1]) => (n, 1),
             _ => {
                 let expected = match kind {
                     Kind::Matrix | Kind::Gaps => "shape (N, D)",
                     Kind::Table => "shape (N, D) or (N,)",
-                    Kind::Vector => "shape (N,) or (N, 1)",
+                    Kind::Vector(_) => "shape (N,) or (N, 1)",
                 };
                 let advice = "Reshape it: one row per transition";
                 return Err(self.invalid(Problem::WrongRank, name, format!("shape {shape:?}"), expected, advice));
@@ -270,7 +286,7 @@ impl Hdf5 {
         }
         let unwritten = match kind {
             Kind::Matrix | Kind::Gaps | Kind::Table => Unwritten::Refuse,
-            Kind::Vector => Unwritten::Fill,
+            Kind::Vector(beside) => Unwritten::Fill(beside),
         };
         let filled = self.ensure_stored(name, &dataset, unwritten)?;
         let data = guard(&self.path, name, || numbers::read_f32(&dataset, &datatype))?;
@@ -295,7 +311,14 @@ impl Hdf5 {
         }
         filled.into_iter().for_each(|note| self.note(note));
         let rounded = matches!(datatype, Datatype::FloatingPoint { size: 8, .. });
-        Ok(Column { data, rows, dim, rounded })
+        let losses = if rounded && !matches!(kind, Kind::Gaps) && rounding::is_doubtful(&data, dim) {
+            // Only a note depends on these numbers.
+            let stored = guard(&self.path, name, || numbers::first_f64(&dataset, rows)).unwrap_or_default();
+            rounding::losses(&stored, &data, dim)
+        } else {
+            vec![0.0; dim]
+        };
+        Ok(Column { data, rows, dim, rounded, losses })
     }
 
     fn ensure_finite(

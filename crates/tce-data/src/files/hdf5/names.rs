@@ -3,6 +3,7 @@
 use std::fs;
 use std::io;
 use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use hdf5_pure::Superblock;
 
@@ -41,6 +42,8 @@ pub(super) struct Names {
     image: Image,
     root: u64,
     top: Links,
+    /// Header and links of the last group at the top level that was looked into. robomimic's `data` holds all episodes.
+    recent: Mutex<Option<(u64, Arc<Links>)>>,
 }
 
 impl Names {
@@ -50,7 +53,7 @@ impl Names {
         let root = superblock.root_group_address.checked_sub(superblock.base_address.get());
         let root = root.ok_or_else(|| malformed("a root before the start of the file"))?;
         let top = image.links(root)?.ok_or_else(|| malformed("a root that is not a group"))?;
-        Ok(Self { image, root, top })
+        Ok(Self { image, root, top, recent: Mutex::default() })
     }
 
     /// Whether `name` exists at the top level or at the end of a path. A link that leads to no object counts.
@@ -91,11 +94,11 @@ impl Names {
             let table = if at == self.root {
                 &self.top
             } else {
-                let Some(links) = self.image.links(at)? else {
+                let Some(links) = self.links(at, path.len())? else {
                     return Ok(dangling());
                 };
                 inner = links;
-                &inner
+                &*inner
             };
             match table.get(&part) {
                 None => return Ok(dangling()),
@@ -121,10 +124,24 @@ impl Names {
                 Some(Link::Unknown(kind)) => return Ok(Found::Nowhere(Broken::Unknown(*kind))),
             }
         }
-        match self.image.links(at)? {
-            Some(members) => Ok(Found::Group(members.into_keys().collect())),
+        match self.links(at, path.len())? {
+            Some(members) => Ok(Found::Group(members.keys().cloned().collect())),
             None => Ok(Found::At { path: path.join("/"), header: at }),
         }
+    }
+
+    /// The links of the group with the object header at `header`, `depth` names below the top level; `None` if the object
+    /// is not a group.
+    fn links(&self, header: u64, depth: usize) -> io::Result<Option<Arc<Links>>> {
+        let mut recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, links)) = recent.as_ref().filter(|(at, _)| *at == header) {
+            return Ok(Some(Arc::clone(links)));
+        }
+        let links = self.image.links(header)?.map(Arc::new);
+        if depth == 1 && links.is_some() {
+            *recent = links.clone().map(|links| (header, links));
+        }
+        Ok(links)
     }
 
     /// The patch for a data set that the library does not read in its stored form.

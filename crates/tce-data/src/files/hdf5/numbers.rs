@@ -70,6 +70,11 @@ pub(super) fn finite_f64(dataset: &Dataset, datatype: &Datatype, at: usize, dim:
     row.get(at % dim).copied().filter(|x| x.is_finite())
 }
 
+/// The first numbers of a float64 data set of this many rows: enough of them to judge the others by.
+pub(super) fn first_f64(dataset: &Dataset, rows: usize) -> Result<Vec<f64>, Error> {
+    dataset.read_f64_rows(0, WINDOW.min(rows as u64))
+}
+
 /// The number of integers that differ from the stored ones; place (counted row by row) and value of the first one.
 pub(super) struct Inexact {
     pub count: usize,

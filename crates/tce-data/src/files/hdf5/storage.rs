@@ -2,7 +2,7 @@
 
 use hdf5_pure::{Chunk, ChunkIndex, Dataset, Error, FormatError, Layout};
 
-use super::{COPY, Hdf5, REPAIR, guard};
+use super::{Beside, COPY, Hdf5, REPAIR, guard};
 use crate::{DataError, Problem};
 
 /// Deflate cannot expand by more than 1032 : 1. If a data set declares more than this times the file's size, its data
@@ -11,12 +11,12 @@ const MAX_EXPANSION: u64 = 1040;
 
 /// How to treat a data set, or a part of one, that was created but never written.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Unwritten {
+pub(super) enum Unwritten<'a> {
     /// Return an error: states and actions made up of zeros are not data.
     Refuse,
     /// Read it as its fill value (default: zero), as h5py does. The file's bytes do not limit its size. It must
-    /// therefore have as many rows as `observations`, which must be present.
-    Fill,
+    /// therefore have as many rows as a field that was read.
+    Fill(Beside<'a>),
 }
 
 /// What the header says about a data set.
@@ -29,7 +29,7 @@ struct Told<'a> {
     announced: Option<u64>,
     /// Whether the file is large enough to hold them in compressed form.
     fits: bool,
-    unwritten: Unwritten,
+    unwritten: Unwritten<'a>,
 }
 
 /// Bytes of a block of elements; `None` above 2^64.
@@ -44,7 +44,7 @@ impl Hdf5 {
         &self,
         name: &str,
         dataset: &Dataset,
-        unwritten: Unwritten,
+        unwritten: Unwritten<'_>,
     ) -> Result<Option<String>, DataError> {
         let (shape, element) = guard(&self.path, name, || Ok((dataset.shape()?, dataset.element_size()?)))?;
         let announced = bytes_of(element, &shape);
@@ -136,29 +136,20 @@ impl Hdf5 {
                 "every row written",
                 "The program that made the file did not finish: write it again, or cut the file to the written rows",
             )),
-            Unwritten::Fill => {
-                let (rows, here) = (self.written_rows()?, shape.first().copied().unwrap_or(1));
-                if here != rows {
+            Unwritten::Fill(Beside { field, rows }) => {
+                let here = shape.first().copied().unwrap_or(1);
+                if here != *rows as u64 {
                     return Err(self.invalid(
                         Problem::RowCount,
                         name,
                         format!("{here} rows, {what}"),
-                        format!("{rows} rows, as in `observations`"),
+                        format!("{rows} rows, as in `{field}`"),
                         "The fields must have one row per transition: write the file again",
                     ));
                 }
                 Ok(Some(format!("`{name}`: {what}; read as its fill value, as h5py does")))
             }
         }
-    }
-
-    /// The number of rows of `observations`, which must be stored.
-    fn written_rows(&self) -> Result<u64, DataError> {
-        let name = "observations";
-        let dataset = self.open_dataset(name)?;
-        self.ensure_stored(name, &dataset, Unwritten::Refuse)?;
-        let shape = guard(&self.path, name, || dataset.shape())?;
-        Ok(shape.first().copied().unwrap_or(1))
     }
 
     /// The error for data that are stored in another file.

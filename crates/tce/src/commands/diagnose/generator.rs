@@ -127,8 +127,7 @@ impl GeneratorArgs {
             return self.cycles(output, device);
         }
         let config = self.config.layered(Some(self.task), None)?.config()?;
-        let inputs =
-            Inputs::of_task(self.task, &self.data, Some(config.source.rows))?.with_target_rows(config.target.rows)?;
+        let inputs = Inputs::of_config(self.task, &self.data, &config)?;
         let (training, held_out) = hold_out(&inputs.target.rows, self.held_out);
         let hash = format!("{} without its last {} rows", inputs.target.hash, held_out.len());
         let inputs = inputs.with_target(training, hash);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use tce_base::plus_minus;
+use tce_report::analysis::DIVERGED;
 use tce_run::sweep::Kind;
 use tce_run::sweep::gather::Gathered;
 use tce_run::sweep::status::Status;
@@ -73,7 +74,7 @@ pub fn gathered(gathered: &Gathered) -> String {
         if !tasks.contains(&row.task.as_str()) {
             tasks.push(&row.task);
         }
-        cells.entry((&row.task, &row.method)).or_default().extend(row.score);
+        cells.entry((&row.task, &row.method)).or_default().extend(row.score.or(row.diverged.then_some(DIVERGED)));
     }
     let header: Vec<&str> = std::iter::once("task").chain(methods.iter().copied()).collect();
     let rows = tasks.iter().map(|task| {
@@ -85,6 +86,12 @@ pub fn gathered(gathered: &Gathered) -> String {
     let mut text = table(&header, rows);
     for sentence in sentences(&tasks, &methods, &cells) {
         text += &format!("\n{sentence}");
+    }
+    let diverged = gathered.rows.iter().filter(|row| row.diverged).count();
+    if diverged > 0 {
+        text += &format!(
+            "\n{diverged} policies could not act to the end of their evaluation: each counts as {DIVERGED} points."
+        );
     }
     let problems = gathered.missing.len() + gathered.corrupt.len() + gathered.conflicts.len();
     if problems > 0 {
