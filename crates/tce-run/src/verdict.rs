@@ -1,6 +1,6 @@
 //! Recommends a policy from the two data sets alone ([`crate::off_policy_evaluation`]), and says how sure that is.
 //!
-//! Every policy is tried from the same target states in the same learned models, so that two policies are compared episode by
+//! Every policy is tried from the same states in the same learned models, so that two policies are compared episode by
 //! episode. The rule, measured in bench/expansion.md:
 //!
 //! 1. The standard is the baseline whose supported return is highest.

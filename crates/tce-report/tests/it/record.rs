@@ -179,7 +179,7 @@ fn runs_of_one_recipe_are_one_column_whatever_study_they_are_from() {
         analysis.warnings.iter().find(|w| w.text.contains("BC has different settings on different tasks")).unwrap();
     assert_eq!(
         told.details,
-        ["preset default, fade = 1: hopper-morph/medium/expert", "preset default: ant-morph/medium/expert"]
+        ["preset default: ant-morph/medium/expert", "preset default, fade = 1: hopper-morph/medium/expert"]
     );
 }
 

@@ -342,7 +342,12 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
         ["--source", "source.hdf5", "--target", "target.hdf5", "--dynamics-steps", "20", "--fitted-q-steps", "0"];
     let compared = tce_json(dir.path(), &[&["compare"][..], &both, &data].concat());
     assert!(compared["policies"].as_array().unwrap().len() == 2 && compared["held_out"][0].is_number(), "{compared}");
-    assert_eq!(compared["policies"][0]["returns"].as_array().unwrap().len(), 3 * 32, "three networks, 32 starts");
+    let lanes = compared["policies"][0]["returns"].as_array().unwrap().len();
+    assert_eq!(
+        lanes,
+        3 * (32 + 4),
+        "three networks, 32 target states, and the first states of the source's four episodes"
+    );
     let of_the_zoo = tce_json(dir.path(), &[&["compare", "zoo:halfcheetah-source-medium"][..], &data].concat());
     assert_eq!(of_the_zoo["policies"][0]["policy"], "zoo:halfcheetah-source-medium");
     let foreign = tce(dir.path(), &[&["compare", "zoo.safetensors"][..], &data].concat());
