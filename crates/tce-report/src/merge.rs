@@ -15,23 +15,13 @@ use crate::study::{Method, Missing, Run, Study};
 /// # Panics
 /// If there is none.
 pub fn merge(studies: Vec<Study>) -> Study {
-    let alone = studies.len() == 1;
-    let mut studies = studies.into_iter();
-    let first = studies.next().expect("at least one study");
-    if alone {
-        return first;
-    }
-    let mut merging = Merging {
-        names: vec![first.name.clone()],
-        origins: vec![0; first.runs.len()],
-        places: BTreeMap::new(),
-        renamed: Vec::new(),
-        out: first,
+    let studies = match <[Study; 1]>::try_from(studies) {
+        Ok([alone]) => return alone,
+        Err(studies) => studies,
     };
-    for (place, run) in merging.out.runs.iter().enumerate() {
-        merging.places.entry(Work::of(run)).or_insert(place);
-    }
-    studies.for_each(|study| merging.join(study));
+    assert!(!studies.is_empty(), "at least one study");
+    let mut merging = Merging::default();
+    studies.into_iter().for_each(|study| merging.join(study));
     // What one of them lacks another one may have; so far a method has one name.
     let done: BTreeSet<_> = merging.out.runs.iter().map(|r| (r.task, r.method.as_str(), Some(r.member.seed))).collect();
     merging.out.missing.retain(|m| !done.contains(&(m.task, m.method.as_str(), m.seed)));
@@ -43,14 +33,17 @@ pub fn merge(studies: Vec<Study>) -> Study {
 }
 
 /// Studies on their way into one.
+#[derive(Default)]
 struct Merging {
     out: Study,
     /// The study that each run of `out` came from.
     origins: Vec<usize>,
     /// The place of the first run of every work in `out`.
     places: BTreeMap<Work, usize>,
-    /// The studies' names, each once.
+    /// The studies' names, each once; of a merged study also those that its columns are called after.
     names: Vec<String>,
+    /// Studies joined so far.
+    joined: usize,
     /// Methods that have another id than in their study, because that was taken: as they were, and the new id.
     renamed: Vec<(Method, String)>,
 }
@@ -83,7 +76,27 @@ fn of_study(method: &Method, name: &str) -> Method {
     Method { id: named(&method.id), title: named(&method.title), plain: false, ..method.clone() }
 }
 
+/// The method of a column that was called after a study ([`of_study`]), and that study; others as they are.
+fn without_study(method: Method) -> (Method, Option<String>) {
+    let suffix = method.id.strip_prefix(&method.variant).filter(|s| s.starts_with(" (") && s.ends_with(')'));
+    match suffix.and_then(|suffix| Some((suffix, method.title.strip_suffix(suffix)?))) {
+        Some((suffix, title)) => {
+            let name = suffix[2..suffix.len() - 1].to_owned();
+            (Method { id: method.variant.clone(), title: title.to_owned(), plain: true, ..method }, Some(name))
+        }
+        None => (method, None),
+    }
+}
+
 impl Merging {
+    /// The number of the study `name`.
+    fn number(&mut self, name: &str) -> usize {
+        self.names.iter().position(|n| n == name).unwrap_or_else(|| {
+            self.names.push(name.to_owned());
+            self.names.len() - 1
+        })
+    }
+
     /// The id that a method of the study `name` has from now on.
     fn id(&mut self, method: Method, name: &str) -> String {
         match self.out.methods.iter().find(|m| m.id == method.id) {
@@ -108,26 +121,37 @@ impl Merging {
     }
 
     fn join(&mut self, other: Study) {
-        let number = self.names.len();
         let mut name = other.name.clone();
         while self.names.contains(&name) {
             name += "'";
         }
-        self.names.push(name.clone());
-        let ids: BTreeMap<String, String> =
-            other.methods.into_iter().map(|m| (m.id.clone(), self.id(m, &name))).collect();
-        let of = |id: String| ids.get(&id).cloned().unwrap_or(id);
-        for run in other.runs {
-            self.add(Run { method: of(run.method), ..run }, number);
+        let number = self.number(&name);
+        // Columns of a merged study come apart again: its runs may be one column with those of this one.
+        let mut ids: BTreeMap<String, (String, usize)> = BTreeMap::new();
+        for method in other.methods {
+            let id = method.id.clone();
+            let (method, study) = without_study(method);
+            let origin = study.map_or(number, |study| self.number(&study));
+            ids.insert(id, (self.id(method, &name), origin));
         }
+        for run in other.runs {
+            let (method, origin) = ids.get(&run.method).cloned().unwrap_or_else(|| (run.method.clone(), number));
+            self.add(Run { method, ..run }, origin);
+        }
+        let of = |id: String| ids.get(&id).map_or(id, |known| known.0.clone());
         let out = &mut self.out;
         // The name is a heading: some names are enough for one.
-        if number < 3 {
-            out.name = format!("{} + {}", out.name, other.name);
-        } else if !out.name.ends_with(" + …") {
-            out.name += " + …";
+        match self.joined {
+            0 => out.name = other.name,
+            1 | 2 => out.name = format!("{} + {}", out.name, other.name),
+            _ if !out.name.ends_with(" + …") => out.name += " + …",
+            _ => {}
         }
-        out.directory = format!("{}, {}", out.directory, other.directory);
+        if self.joined > 0 {
+            out.directory += ", ";
+        }
+        out.directory += &other.directory;
+        self.joined += 1;
         out.sweep |= other.sweep;
         add_new(&mut out.notes, other.notes);
         add_new(&mut out.conflicts, other.conflicts);

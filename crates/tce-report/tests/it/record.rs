@@ -168,6 +168,13 @@ fn runs_of_one_recipe_are_one_column_whatever_study_they_are_from() {
     let all = merge(vec![first, second, third.clone()]);
     assert_eq!(columns(&all), ["bc (first, second)", "bc (first, second)", "bc (third)"]);
     assert!(all.missing.is_empty(), "the second study has it: {:?}", all.missing);
+    // A record of this has columns that are called after studies. Beside further runs they come apart and together again.
+    let record = read_again(&all, &root.path().join("all.jsonl"));
+    let more = merge(vec![record, one("fourth", 2, "fade = 2\n", &["fade"])]);
+    assert_eq!(
+        columns(&more),
+        ["bc (first, second)", "bc (first, second)", "bc (third, fourth)", "bc (third, fourth)"]
+    );
     // In one study on different tasks they stay one column, and the reader is told.
     third.missing.clear();
     let directory = root.path().join("ant");
