@@ -12,6 +12,7 @@ use pyo3::types::PyDict;
 use tce_data::{Columns, LoadOptions, Loaded, Transitions, from_columns};
 use tce_run::augment::own_tables::joined;
 use tce_run::own::{DataFormat, Writing};
+use tce_run::tables::is_augmented;
 
 use crate::errors::{Raise, exception};
 use crate::settings::Robot;
@@ -23,22 +24,24 @@ pub struct Table {
     pub rows: Arc<Transitions>,
     columns: BTreeMap<String, Vec<f32>>,
     report: Option<String>,
+    /// Whether the program made the column `origin`: one of the user's own may mean anything.
+    augmented: bool,
 }
 
 impl Table {
     /// Rows that the program made.
     pub fn of(rows: Transitions) -> Self {
-        Self { rows: Arc::new(rows), columns: BTreeMap::new(), report: None }
+        Self { rows: Arc::new(rows), columns: BTreeMap::new(), report: None, augmented: false }
     }
 
     fn loaded(loaded: Loaded) -> Self {
         let report = serde_json::to_string(&loaded.report).ok();
-        Self { rows: Arc::new(loaded.transitions), columns: loaded.columns, report }
+        Self { rows: Arc::new(loaded.transitions), columns: loaded.columns, report, augmented: false }
     }
 
-    /// The further column `name`, if there is one.
-    pub fn column_of(&self, name: &str) -> Option<&[f32]> {
-        self.columns.get(name).map(Vec::as_slice)
+    /// The column of `tce augment` that tells target rows (0) from others, if this is a table of it.
+    pub fn origin(&self) -> Option<&[f32]> {
+        self.columns.get("origin").filter(|_| self.augmented).map(Vec::as_slice)
     }
 }
 
@@ -88,7 +91,8 @@ impl Table {
     fn load(py: Python<'_>, path: PathBuf, robot: Robot) -> PyResult<Self> {
         let own = robot.own().or_raise(py)?;
         let options = LoadOptions { all_columns: true, ..own.load_options() };
-        aside(py, || tce_data::load(&path, &options))?.map(Self::loaded).or_raise(py)
+        let (loaded, augmented) = aside(py, || (tce_data::load(&path, &options), is_augmented(&path)))?;
+        loaded.map(|loaded| Self { augmented, ..Self::loaded(loaded) }).or_raise(py)
     }
 
     /// Checks arrays as a file with the same columns is checked.
@@ -142,7 +146,8 @@ impl Table {
             known,
         };
         let columns = further.iter().map(|(name, column)| (name.clone(), copied(column))).collect();
-        Self { rows: Arc::new(rows), columns, report }
+        // Target rows among extra ones are found by their content all the same.
+        Self { rows: Arc::new(rows), columns, report, augmented: false }
     }
 
     fn __len__(&self) -> usize {
@@ -198,14 +203,14 @@ impl Table {
         let pick = |values: &Vec<f32>| indices.iter().map(|&i| values[i]).collect();
         let columns = self.columns.iter().map(|(name, values)| (name.clone(), pick(values))).collect();
         let rows = aside(py, || Arc::new(self.rows.select(&indices)))?;
-        Ok(Self { rows, columns, report: None })
+        Ok(Self { rows, columns, report: None, augmented: self.augmented })
     }
 
     /// These rows, then `generated` ones, with the column `origin`, as `tce augment` writes them.
     fn joined(&self, py: Python<'_>, generated: &Self) -> PyResult<Self> {
         let (rows, origin) = aside(py, || joined(&self.rows, &generated.rows))?;
         let columns = BTreeMap::from([("origin".to_owned(), origin)]);
-        Ok(Self { rows: Arc::new(rows), columns, report: None })
+        Ok(Self { rows: Arc::new(rows), columns, report: None, augmented: true })
     }
 
     /// What `tce data check` notices, as JSON.

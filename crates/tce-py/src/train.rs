@@ -47,7 +47,7 @@ pub fn train(
     let comparison = if wanted.compare { Comparison::Recommend } else { Comparison::Skip };
     let target = target.rows.clone();
     let source = source.filter(|_| wanted.compare).map(|table| table.rows.clone());
-    let extra = extra.map(|table| (table.rows.clone(), table.column_of("origin").map(<[f32]>::to_vec)));
+    let extra = extra.map(|table| (table.rows.clone(), table.origin().map(<[f32]>::to_vec)));
     let trained = attended(py, progress, move || {
         tce_base::ensure_folder(&out)?;
         let extra = extra.as_ref().map(|(rows, origin)| (rows.clone(), origin.as_deref()));

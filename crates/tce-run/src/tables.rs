@@ -18,6 +18,11 @@ const LEAST_ROWS: usize = 10;
 /// An attribute of every file of `tce augment`, whose column `origin` tells target rows (0) from others.
 const AUGMENTED: &str = "target_sha256";
 
+/// Whether `tce augment` wrote this file.
+pub fn is_augmented(path: &Path) -> bool {
+    read_attributes(path).is_ok_and(|attributes| attributes.contains_key(AUGMENTED))
+}
+
 /// A loaded file.
 #[derive(Clone, Debug)]
 pub struct Table {
@@ -80,8 +85,7 @@ impl Table {
         let options = LoadOptions { all_columns: true, ..options.clone() };
         let (Loaded { transitions, columns, .. }, hash) = Self::loaded(path, &options)?;
         // In a file of the user's own a column of this name may mean anything.
-        let ours = || read_attributes(path).is_ok_and(|attributes| attributes.contains_key(AUGMENTED));
-        let origin = columns.get("origin").filter(|_| ours());
+        let origin = columns.get("origin").filter(|_| is_augmented(path));
         Self::without_target(transitions.into(), origin.map(Vec::as_slice), path, hash, target)
     }
 
