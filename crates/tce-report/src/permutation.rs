@@ -12,7 +12,7 @@ use crate::stats::{Scores, StatsError, probability_of_improvement};
 const COUNTED: u64 = 200_000;
 
 /// How often a random assignment of a task's runs to the two methods gives a probability of improvement as far from one half as
-/// the true one: a stratified permutation test, two-sided. All assignments are counted; where a task has more than [`COUNTED`], random
+/// the true one: a stratified permutation test, two-sided. All assignments are counted; where a task has more than 200 000, random
 /// ones are, `shuffles` of them. With few runs it cannot become small, whereas a bootstrap's interval can shrink to a point.
 ///
 /// # Errors

@@ -4,9 +4,9 @@
 //! input). An imagined episode keeps to one network of the ensemble, and ends where the network says that the state is terminal, where the
 //! state has left everything that either robot has been seen in, or after as many steps as the longest target episode has.
 //!
-//! Imagined episodes begin at target states, and where the source's episodes began, if that is near the target's states ([`places::NEAR`]). A few
-//! target episodes have a few first states, which a clone knows by heart; whether it can start elsewhere is what most often decides
-//! (bench/expansion.md).
+//! Imagined episodes begin at target states, and where the source's episodes began, if that is no further from the target's states than three
+//! times the median distance between its episodes. A few target episodes have a few first states, which a clone knows by heart; whether it
+//! can start elsewhere is what most often decides (bench/expansion.md).
 //!
 //! The *supported return* counts until the episode is far from every target state ([`FAR`]): beyond, the networks are
 //! not to be trusted. Each later step counts the worst reward of the target's rows, if that is below 0: where rewards are costs, leaving early

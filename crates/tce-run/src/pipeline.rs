@@ -100,7 +100,7 @@ impl<'a> RunSpec<'a> {
 }
 
 impl Config {
-    /// Whether runs of this configuration look at the setting of this full name; the same keys as in [`RunSpec`].
+    /// Whether runs of this configuration look at the setting of this full name; the same keys as decide a run's own key.
     pub fn uses(&self, key: &str) -> bool {
         let (section, rest) = key.split_once('.').unwrap_or((key, ""));
         let table = rest.split('.').next().unwrap_or_default();
