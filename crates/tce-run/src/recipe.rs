@@ -102,6 +102,18 @@ fn changes(
     Some(differ.map(change).collect())
 }
 
+/// The preset that fewest of the `used` settings differ from, and these. Of presets that are as near, it is the one that is nearest in all
+/// settings.
+fn nearest<'a>(
+    known: &'a [Known],
+    own: &BTreeMap<String, String>,
+    used: impl Fn(&str) -> bool,
+) -> Option<(&'a Known, Vec<Change>)> {
+    let all = |k: &Known| changes(own, &k.settings, |_| true).map_or(0, |all| all.len());
+    let of = |k: &'a Known| Some((k, changes(own, &k.settings, &used)?));
+    known.iter().filter_map(of).min_by_key(|(k, changed)| (changed.len(), all(k)))
+}
+
 impl Recipes {
     /// The recipe of a run of `variant`, as its folder is called.
     pub fn of(&mut self, task: Task, variant: &str, folder: &RunFolder) -> Arc<Recipe> {
@@ -118,8 +130,7 @@ impl Recipes {
             let known = self.presets.entry(place).or_insert_with(|| presets(task, variant));
             let own = settings(&folder.config);
             let used = |key: &str| config.as_ref().is_none_or(|c| c.uses(key));
-            let nearest = known.iter().filter_map(|k| Some((k, changes(&own, &k.settings, used)?)));
-            if let Some((preset, changed)) = nearest.min_by_key(|(_, changed)| changed.len()) {
+            if let Some((preset, changed)) = nearest(known, &own, used) {
                 (recipe.preset, recipe.changed) = (Some(preset.name.clone()), changed);
             }
             recipe.paper = known.iter().find(|k| k.name == "paper").map(|k| budget(&k.config, rows));
@@ -146,16 +157,20 @@ mod tests {
         let sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
         let own = Layered::new(preset, Some(task()), Some(variant), None, &sets).unwrap().config().unwrap();
         let (known, settings) = (presets(task(), variant), settings(&own.to_toml()));
-        let used = |key: &str| own.uses(key);
-        let nearest = known.iter().filter_map(|k| Some((k.name.clone(), changes(&settings, &k.settings, used)?)));
-        let (name, changed) = nearest.min_by_key(|(_, changed)| changed.len())?;
-        Some((name, changed.iter().map(ToString::to_string).collect()))
+        let (preset, changed) = nearest(&known, &settings, |key| own.uses(key))?;
+        Some((preset.name.clone(), changed.iter().map(ToString::to_string).collect()))
     }
 
     #[test]
     fn presets_are_recognised_by_their_settings() {
         for (preset, name) in [(Preset::Default, "default"), (Preset::Quick, "quick"), (Preset::Paper, "paper")] {
-            for variant in [Variant::TceOg, Variant::Bc, Variant::Prior(Algorithm::Igdf, Mode::Corrected)] {
+            for variant in [
+                Variant::TceOg,
+                Variant::Bc,
+                Variant::TargetOnly,
+                Variant::Prior(Algorithm::Rebrac, Mode::Corrected),
+                Variant::Prior(Algorithm::Igdf, Mode::Corrected),
+            ] {
                 assert_eq!(found(preset, variant, &[]), Some((name.to_owned(), vec![])), "{variant}");
             }
         }
