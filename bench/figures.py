@@ -23,7 +23,7 @@ SHIFTS = ["morph", "kinematic", "gravity"]
 BLUE, ORANGE, GREEN, GREY, PALE = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c", "#dfe2e7"
 OURS = [("bc-ensemble", "five clones of the target rows, ours", BLUE), ("tce-og", "TCE(OG), ours", ORANGE)]
 # How a method is called in records from before it was the default.
-SAME = {"tce-og (fade)": "tce-og"}
+SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied)": "tce-og"}
 THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", PALE)]
 
 
@@ -36,12 +36,16 @@ def runs():
 
 
 def scores():
-    """Scores of single runs by task and method, of columns with a preset's own settings. Of two records of a seed the later file counts."""
-    found = defaultdict(dict)
-    for _, run in runs():
+    """Scores of single runs by task and method, of columns with a preset's own settings. Of two records of a seed the later file counts; of
+    TCE(OG), whose generator has changed, the seeds of the latest file alone."""
+    found, newest = defaultdict(dict), {}
+    for record, run in runs():
         if run["recipe"]["preset"] == "default":
+            key = run["task"], SAME.get(run["method"], run["method"])
+            if key[1] == "tce-og" and newest.setdefault(key, record) != record:
+                newest[key], found[key] = record, {}
             for member in run["folder"]["members"]:
-                found[run["task"], SAME.get(run["method"], run["method"])][member["seed"]] = member["verdict"]["score"]
+                found[key][member["seed"]] = member["verdict"]["score"]
     return {key: [seeds[k] for k in sorted(seeds)] for key, seeds in found.items()}
 
 
