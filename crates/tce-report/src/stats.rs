@@ -240,7 +240,7 @@ impl Bootstrap {
     }
 }
 
-fn mean_of(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+pub(crate) fn mean_of(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let n = values.len() as f64;
     values.sum::<f64>() / n
 }

@@ -10,7 +10,7 @@ use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
 use tce_learn::{DynamicsConfig, Mode, RowScores};
 use tce_nn::Device;
-use tce_report::analysis::DIVERGED;
+use tce_report::analysis::counted;
 use tce_zoo::actors::{Arena, Evaluation};
 
 use crate::augment::single_stage;
@@ -51,10 +51,9 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// What the seeds' policies count for: their scores, and [`DIVERGED`] for a policy that could not act to the end.
+    /// What the seeds' policies count for ([`counted`]); one that could not act to the end has diverged.
     pub fn counted(&self) -> Vec<f64> {
-        let of =
-            |(score, evaluation): (&Option<f64>, &Evaluation)| score.or(evaluation.failed.as_ref().map(|_| DIVERGED));
+        let of = |(score, evaluation): (&Option<f64>, &Evaluation)| counted(*score, evaluation.failed.is_some());
         self.scores.iter().zip(&self.learned.evaluations).filter_map(of).collect()
     }
 
@@ -82,25 +81,23 @@ struct RunSpec<'a> {
 
 impl<'a> RunSpec<'a> {
     fn new(inputs: &Inputs, config: &'a Config, seeds: &'a [u64]) -> Self {
-        let two_stages = config.mixture.generated == GeneratedRows::Tce;
-        let relabelled = config.mixture.source == SourceRows::Relabelled;
         Self {
             inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
             mixture: &config.mixture,
             learner: config.learner.used(),
             evaluation: &config.evaluation,
-            generator: two_stages.then_some(&config.generator),
-            filter: two_stages.then_some(&config.filter),
-            labels: (two_stages || relabelled).then_some(&config.labels),
-            dynamics: (two_stages && config.filter.by_dynamics()).then_some(&config.dynamics),
+            generator: config.uses("generator").then_some(&config.generator),
+            filter: config.uses("filter").then_some(&config.filter),
+            labels: config.uses("labels").then_some(&config.labels),
+            dynamics: config.uses("dynamics").then_some(&config.dynamics),
             joint: used_of_single_stage(&config.single_stage, config.mixture.generated, config.learner.algorithm),
         }
     }
 }
 
 impl Config {
-    /// Whether runs of this configuration look at the setting of this full name; the same keys as decide a run's own key.
+    /// Whether runs of this configuration look at the setting, or the table, of this full name. It decides a run's key.
     pub fn uses(&self, key: &str) -> bool {
         let (section, rest) = key.split_once('.').unwrap_or((key, ""));
         let table = rest.split('.').next().unwrap_or_default();

@@ -43,13 +43,10 @@ pub fn of_places(places: &[PathBuf]) -> Result<Study> {
         for path in records {
             let mut study = record::read(&path)?;
             // Beside the presets of this program: those of the one that wrote the record may have been others.
-            for run in &mut study.runs {
+            // Without its settings a run has the recipe that was written down.
+            for run in study.runs.iter_mut().filter(|r| !r.folder.config.is_empty()) {
                 let variant = study.methods.iter().find(|m| m.id == run.method).map_or("", |m| m.variant.as_str());
-                let recipe = recipes.of(run.task, variant, &run.folder);
-                // Without its settings it has the recipe that was written down.
-                if !run.folder.config.is_empty() {
-                    run.recipe = recipe;
-                }
+                run.recipe = recipes.of(run.task, variant, &run.folder);
             }
             studies.push(study);
         }

@@ -35,7 +35,6 @@ use std::path::Path;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
 use tce_nn::{Device, MlpConfig, NamedParameters, NetworkError, Tensor};
 
 use crate::actor::ActorConfig;
@@ -198,8 +197,7 @@ pub struct Support {
     config: BosaConfig,
     behaviour: Cvae,
     dynamics: Vec<Cvae>,
-    members: Vec<Streams>,
-    /// Tells whose s' is known.
+    /// Has the members' streams, and tells whose s' is known.
     buffer: Buffer,
 }
 
@@ -235,7 +233,6 @@ impl Bosa {
         let rule = Support {
             behaviour: models.next().expect("the first of them"),
             dynamics: models.collect(),
-            members: buffer.streams(),
             buffer: buffer.clone(),
             config: config.clone(),
         };
@@ -249,7 +246,7 @@ impl Support {
         let (c, x) = Modelled::Dynamics.split(batch);
         let density = |(i, model): (usize, &Cvae)| {
             let name = format!("bosa density {i}");
-            model.log_density(c.clone(), x.clone(), self.config.density(), &self.members, &name, step)
+            model.log_density(c.clone(), x.clone(), self.config.density(), &self.buffer.streams(), &name, step)
         };
         let densities: Vec<_> = self.dynamics.par_iter().enumerate().map(density).collect();
         let least = densities.into_iter().reduce(Tensor::min_pair).expect("at least one model");
@@ -277,7 +274,8 @@ pub fn critic_target(batch: &Minibatch, q: Tensor<3>, discount: f64, mode: Mode)
 
 impl UpdateRule for Support {
     fn update(&self, nets: &mut ActorCritic, batch: &Minibatch, step: u64, meter: &mut Meter) {
-        let Self { config: c, behaviour, members, .. } = self;
+        let Self { config: c, behaviour, buffer, .. } = self;
+        let members = &buffer.streams();
         let (mask, y) = rayon::join(
             || self.supported(batch, step),
             || {

@@ -234,10 +234,8 @@ impl BatchTransform for Classifiers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::buffer::Member;
-    use std::sync::Arc;
-    use tce_base::Streams;
-    use tce_data::{Standardizer, Transitions};
+    use crate::buffer::tests::of_two_scales;
+    use tce_data::Transitions;
     use tce_nn::{cpu, host, tensor};
 
     /// Two members with the same rows and networks, but for the scale of their rewards, which are all 0. Every fifth row is
@@ -250,15 +248,7 @@ mod tests {
             t.push(&[x], &[-x], 0.0, &[x], i % 5 == 4, false);
         }
         t.known = t.terminals.iter().map(|terminal| !terminal).collect();
-        let (t, streams, standardizer) = (Arc::new(t), Streams::new(1), Standardizer::identity(1));
-        let member = |reward_scale| Member {
-            streams,
-            parts: vec![t.clone(), t.clone()],
-            standardizer: standardizer.clone(),
-            reward_scale,
-            row_scores: None,
-        };
-        let buffer = Buffer::new(vec![member(1.0), member(10.0)], 64).unwrap();
+        let buffer = of_two_scales(t, 2, 64);
         let config = DaraConfig { hidden: vec![8], ..DaraConfig::default() };
         let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
         let mut dara = Dara::new(&buffer, &config, &iql, Regulariser::None, 1, &cpu()).unwrap();

@@ -191,10 +191,8 @@ impl BatchTransform for Discriminator {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::buffer::Member;
-    use std::sync::Arc;
-    use tce_base::Streams;
-    use tce_data::{Standardizer, Transitions};
+    use crate::buffer::tests::of_two_scales;
+    use tce_data::Transitions;
     use tce_nn::cpu;
 
     #[test]
@@ -220,15 +218,7 @@ mod tests {
             let x = i as f32 / 10.0 - 0.95;
             t.push(&[x], &[x], 0.0, &[x], false, i % 5 == 4);
         }
-        let (t, streams, standardizer) = (Arc::new(t), Streams::new(1), Standardizer::identity(1));
-        let member = |reward_scale| Member {
-            streams,
-            parts: vec![t.clone()],
-            standardizer: standardizer.clone(),
-            reward_scale,
-            row_scores: None,
-        };
-        let buffer = Buffer::new(vec![member(1.0), member(10.0)], 8).unwrap();
+        let buffer = of_two_scales(t, 1, 8);
         let config = SrpoConfig { hidden: vec![8], ..SrpoConfig::default() };
         let iql = IqlConfig { hidden: vec![8], ..IqlConfig::paper() };
         let mut srpo = Srpo::new(&buffer, &config, &iql, Regulariser::None, 1, &cpu()).unwrap();

@@ -428,4 +428,4 @@ pub fn best_trajectories(t: &Transitions, top: f64) -> Result<Transitions, Learn
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -238,11 +238,16 @@ impl Analysis {
     }
 }
 
+/// What a policy counts for that has this score, if it has one, or that [diverged](DIVERGED).
+pub fn counted(score: Option<f64>, diverged: bool) -> Option<f64> {
+    score.or(diverged.then_some(DIVERGED))
+}
+
 /// What a run counts for.
 pub fn score(run: &Run) -> Option<f64> {
     match run.member.verdict {
         Verdict::Score(score) => Some(score),
-        Verdict::Diverged(_) => Some(DIVERGED),
+        Verdict::Diverged(_) => counted(None, true),
         Verdict::Unscored => None,
     }
 }

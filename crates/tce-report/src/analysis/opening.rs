@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::{Aggregate, Analysis, Comparison, Finding, Recommendation};
+use crate::stats::mean_of;
 use crate::study::{order, short};
 
 /// Gaps below this print as 0.0.
@@ -128,12 +129,7 @@ fn recommended(all: &[Recommendation]) -> Option<String> {
             let mut by_task: BTreeMap<_, Vec<(f64, f64)>> = BTreeMap::new();
             many.iter()
                 .for_each(|(r, score, regret)| by_task.entry(order(&r.task)).or_default().push((*score, *regret)));
-            let mean_of = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-            let mean = |f: &dyn Fn(&(f64, f64)) -> f64| {
-                mean_of(
-                    &by_task.values().map(|own| mean_of(&own.iter().map(f).collect::<Vec<_>>())).collect::<Vec<_>>(),
-                )
-            };
+            let mean = |f: fn(&(f64, f64)) -> f64| mean_of(by_task.values().map(|own| mean_of(own.iter().map(f))));
             let of = match (many.len(), by_task.len()) {
                 (all, tasks) if all == tasks => format!("The recommended policies of {tasks} tasks score"),
                 (all, 1) => format!("The {all} recommended policies of one task score"),
@@ -142,8 +138,8 @@ fn recommended(all: &[Recommendation]) -> Option<String> {
             Some(format!(
                 "{of} {:.1} on average. The best policies there to choose from score {:.1} points more on average: that is their \
                  mean regret.",
-                mean(&|r| r.0),
-                mean(&|r| r.1)
+                mean(|r| r.0),
+                mean(|r| r.1)
             ))
         }
     }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 use tce_base::first_damaged;
+use tce_report::analysis::counted;
 
 use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
@@ -29,6 +30,13 @@ pub struct Row {
     pub seconds: f64,
     /// The program that did it.
     pub program: String,
+}
+
+impl Row {
+    /// What the run counts for in a table ([`counted`]).
+    pub fn counted(&self) -> Option<f64> {
+        counted(self.score, self.diverged)
+    }
 }
 
 /// What is known of a piece of work.

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 use tce_base::{FileError, Owner, PROGRAM, read_json, sha256_file, write_json, write_json_first};
 use tce_nn::Device;
-use tce_report::analysis::DIVERGED;
+use tce_report::analysis::counted;
 
 use super::{Entry, Kind, Sweep};
 use crate::augment::{augment_rows, label_models};
@@ -56,7 +56,7 @@ pub struct Outcome {
 impl Outcome {
     /// What the run counts for in a table, as in a report: a policy that diverged is no better than a random one.
     pub fn counted(&self) -> Option<f64> {
-        self.score.or(self.diverged.then_some(DIVERGED))
+        counted(self.score, self.diverged)
     }
 
     /// Whether two copies of the work have the same result.
@@ -360,7 +360,7 @@ mod tests {
         let without = |diverged| Outcome { score: None, diverged, ..outcome(1.0, 5.0) };
         assert_eq!(
             [outcome(1.0, 5.0), without(true), without(false)].map(|o| o.counted()),
-            [Some(1.0), Some(DIVERGED), None]
+            [Some(1.0), Some(0.0), None]
         );
         // The same in another time is the same.
         assert_eq!(sweep.settle(outcome(1.0, 7.0)).unwrap().seconds, 5.0);

@@ -17,6 +17,20 @@ fn member(seed: u64, parts: Vec<Transitions>) -> Member {
     Member { streams: Streams::new(seed), parts, standardizer, reward_scale: 2.0, row_scores: None }
 }
 
+/// Two members that have one seed and `parts` times the same rows, of rewards that are multiplied by 1 and by 10.
+pub(crate) fn of_two_scales(table: Transitions, parts: usize, batch: usize) -> Buffer {
+    let table = Arc::new(table);
+    let parts: Vec<_> = (0..parts).map(|_| table.clone()).collect();
+    let member = |reward_scale| Member {
+        streams: Streams::new(1),
+        parts: parts.clone(),
+        standardizer: Standardizer::identity(1),
+        reward_scale,
+        row_scores: None,
+    };
+    Buffer::new(vec![member(1.0), member(10.0)], batch).unwrap()
+}
+
 #[test]
 fn rows_stay_together_and_dead_inputs_are_left_out() {
     let buffer = Buffer::new(vec![member(1, vec![table(), table()]), member(2, vec![table()])], 9).unwrap();

@@ -74,7 +74,7 @@ pub fn gathered(gathered: &Gathered) -> String {
         if !tasks.contains(&row.task.as_str()) {
             tasks.push(&row.task);
         }
-        cells.entry((&row.task, &row.method)).or_default().extend(row.score.or(row.diverged.then_some(DIVERGED)));
+        cells.entry((&row.task, &row.method)).or_default().extend(row.counted());
     }
     let header: Vec<&str> = std::iter::once("task").chain(methods.iter().copied()).collect();
     let rows = tasks.iter().map(|task| {
