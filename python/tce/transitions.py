@@ -135,8 +135,8 @@ class Transitions:
     def to_dict(self) -> dict[str, npt.NDArray[Any]]:
         """All columns by D4RL's names; further ones behind them. The arrays are views.
 
-        ``known`` is among them where some s' was not logged, so that :func:`load` gives the same rows again. A further column that has
-        the name of one of these is left out.
+        ``known`` is among them where some s' was not logged, so that :func:`load` gives the same rows again, from this mapping or from
+        an HDF5 file of these arrays. A further column that has the name of one of these is left out.
         """
         columns: dict[str, npt.NDArray[Any]] = {
             "observations": self.observations,
@@ -276,7 +276,8 @@ def load(
         A file of D4RL's, OTDF's, Minari's or robomimic's layout, or arrays by D4RL's names: ``observations`` (N, d_s), ``actions``
         (N, d_a), ``rewards`` (N,), ``terminals`` (N,), and where they were logged ``next_observations`` (N, d_s) and ``timeouts``
         (N,). The names of gymnasium (``obs``, ``terminated``, ``truncated``, ...) are taken, too. ``known`` (N,) is False at terminals
-        whose s' was not logged. Any number type and memory layout; numbers become float32. Further columns of shape (N,) are kept.
+        whose s' was not logged. In a file a column of this name that is no such mark is not read as one, and the report says so. Any
+        number type and memory layout; numbers become float32. Further columns of shape (N,) are kept.
     env : str, optional
         The robot is this one of the benchmark's, as in ``"hopper-morph"``: its dimensions and its limit of 1000 steps apply.
     step_limit : int, optional

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,53 @@ def test_unknown_successors_stay_unknown(stops):
     named = {"known": "next_observations_known"}
     other = tce.load({named.get(name, name): column for name, column in given.items()})
     np.testing.assert_array_equal(other.known, data.known)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [lambda a: a, lambda a: a.astype(np.float32), lambda a: a.astype(np.uint8)[:, None]],
+    ids=["booleans", "floats", "a column"],
+)
+def test_unknown_successors_stay_unknown_in_files_of_ones_own(stops, tmp_path, form):
+    h5py = pytest.importorskip("h5py")
+    data = tce.load(stops)
+    columns = {**data.to_dict(), "known": form(data.known)}
+    path = tmp_path / "mine.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, column in columns.items():
+            file[name] = column
+    np.savez(tmp_path / "mine.npz", **columns)
+    with h5py.File(path) as file, np.load(tmp_path / "mine.npz") as arrays:
+        for again in (tce.load(path), tce.load(file), tce.load(dict(arrays))):
+            for name in ("known", "observations", "next_observations", "terminals", "timeouts"):
+                np.testing.assert_array_equal(getattr(again, name), getattr(data, name), err_msg=name)
+            assert again.extra_columns == {} and again.report["unknown_successors"] == 6
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (np.arange(300), "found 2 in row 2; expected 0 or 1"),
+        (np.arange(300) != 3, "found 0 in row 3, which is no terminal"),
+        (np.ones(299, bool), "found 299 rows; expected 300 rows"),
+        (np.ones((300, 2), bool), r"found shape \[300, 2\]"),
+        (np.array([b"yes"] * 300), "found type .*; expected float32"),
+    ],
+)
+def test_a_column_known_of_ones_own_is_told_and_left_alone(target, tmp_path, known, words):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "mine.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, column in {**target, "known": known}.items():
+            file[name] = column
+    data = tce.load(path)
+    assert data.known.all() and len(data) == 300
+    (told,) = [warning for warning in data.report["warnings"] if warning.startswith("`known` was not read as marks")]
+    assert re.search(words, told), told
+    if known.shape == (300,) and known.dtype.kind in "bi":
+        np.testing.assert_array_equal(data.extra_columns["known"], known)
+    else:
+        assert "known" not in data.extra_columns
 
 
 def test_known_is_a_column_only_where_it_tells_something(target, stops):

@@ -14,13 +14,22 @@ use tce_data::Transitions;
 pub struct ScoredRows {
     /// The rows.
     pub rows: Arc<Transitions>,
-    /// One number per row.
+    /// One number per row whose s' is known, in their order.
     pub scores: Option<Arc<Vec<f32>>>,
 }
 
 /// The rows at `indices`, with their numbers.
 pub fn select(rows: &Transitions, scores: Option<&Vec<f32>>, indices: &[usize]) -> ScoredRows {
-    let scores = scores.map(|s| Arc::new(indices.iter().map(|&i| s[i]).collect()));
+    // How many rows before each have a number.
+    let before = |count: &mut usize, &known: &bool| {
+        let before = *count;
+        *count += usize::from(known);
+        Some(before)
+    };
+    let scores = scores.map(|scores| {
+        let at: Vec<usize> = rows.known.iter().scan(0, before).collect();
+        Arc::new(indices.iter().filter(|&&i| rows.known[i]).map(|&i| scores[at[i]]).collect())
+    });
     ScoredRows { rows: Arc::new(rows.select(indices)), scores }
 }
 
@@ -76,6 +85,22 @@ mod tests {
             assert!((share - 0.1).abs() < 0.03, "{n_source} {n_generated}: {share}");
             assert!(mixed.len() >= 20);
         }
+    }
+
+    /// Every third source row has no s', and so no number. That of another row is its state.
+    #[test]
+    fn numbers_stay_with_the_rows_that_have_one() {
+        let mut t = Transitions::new(1, 1);
+        (0..90).for_each(|i| t.push(&[i as f32], &[0.0], 0.0, &[0.0], i % 3 == 2, false));
+        t.known = t.terminals.iter().map(|terminal| !terminal).collect();
+        let numbers = (0..90).filter(|i| i % 3 != 2).map(|i| i as f32).collect();
+        let source = ScoredRows { rows: Arc::new(t), scores: Some(Arc::new(numbers)) };
+        let generated = ScoredRows { scores: Some(Arc::new(vec![500.0; 40])), ..rows(500.0, 40).into() };
+        let mixed = mix(&source, &generated, 0.5, 0);
+        let known = (0..mixed.rows.len()).filter(|&i| mixed.rows.known[i]);
+        let states: Vec<f32> = known.map(|i| mixed.rows.observations[i]).collect();
+        assert_eq!((mixed.rows.len(), states.len() < 80), (80, true), "half of the source's rows, some without s'");
+        assert_eq!(states, *mixed.scores.unwrap());
     }
 
     #[test]

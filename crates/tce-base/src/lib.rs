@@ -49,7 +49,7 @@ pub use scratch::{ATTEMPTS, Scratch};
 pub use sealed::{Sealed, read_sealed, write_sealed};
 pub use statistics::{mean_and_error, mean_std, plus_minus};
 pub use terminal::{set_listener, set_quiet};
-pub use words::{did_you_mean, file_inside, nearest};
+pub use words::{counted, did_you_mean, file_inside, nearest};
 
 /// What files say about who wrote them.
 pub const PROGRAM: &str = concat!("tce ", env!("CARGO_PKG_VERSION"));

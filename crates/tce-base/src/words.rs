@@ -1,9 +1,14 @@
-//! Suggestions for unknown words in messages.
+//! Words of messages: counts, and suggestions for unknown words.
 
 use std::path::Path;
 
 /// Two words are alike from here on (Jaro-Winkler, 0 to 1): one or two letters wrong, missing or swapped.
 const ALIKE: f64 = 0.8;
+
+/// `1 task`, `3 tasks`.
+pub fn counted(n: usize, one: &str, many: &str) -> String {
+    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
+}
 
 /// The most similar word of `known`, if any is similar enough.
 pub fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
@@ -40,6 +45,12 @@ pub fn file_inside(path: &Path, fits: impl Fn(&Path) -> bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_is_no_plural() {
+        let said = [0, 1, 2].map(|n| counted(n, "task is", "tasks are"));
+        assert_eq!(said, ["0 tasks are", "1 task is", "2 tasks are"]);
+    }
 
     #[test]
     fn a_slip_is_found_and_another_word_is_not() {

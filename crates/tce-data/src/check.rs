@@ -5,6 +5,7 @@ use std::fmt;
 use std::hash::{DefaultHasher, Hasher};
 
 use serde::Serialize;
+use tce_base::counted;
 
 use crate::actions::ACTION_TOLERANCE;
 use crate::agents::{ANT_ZEROS, describe, infer_agents};
@@ -93,7 +94,12 @@ pub fn check(data: &Transitions, agent: Option<Agent>) -> Check {
             add(
                 Severity::Error,
                 field,
-                format!("{bad} values are NaN or infinite, the first at row {}, column {}", at / dim, at % dim),
+                format!(
+                    "{} NaN or infinite, the first at row {}, column {}",
+                    counted(bad, "value is", "values are"),
+                    at / dim,
+                    at % dim
+                ),
             );
         }
     }
@@ -168,8 +174,9 @@ fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
     let count = actions.iter().filter(outside).count();
     let at = actions.iter().position(|x| outside(&x))?;
     let worst = actions.iter().fold(0f32, |m, x| m.max(x.abs()));
+    let values = counted(count, "value lies", "values lie");
     Some(format!(
-        "{count} values lie outside of [-1, 1] (largest magnitude {worst}, first at row {}, column {}); the simulator \
+        "{values} outside of [-1, 1] (largest magnitude {worst}, first at row {}, column {}); the simulator \
          clamps them, a policy with a tanh cannot reach them: clip them or rescale the actions",
         at / dim,
         at % dim
@@ -177,7 +184,9 @@ fn actions_outside(actions: &[f32], dim: usize) -> Option<String> {
 }
 
 fn duplicate_share(data: &Transitions) -> f64 {
-    let rows = Rows::transitions(data);
+    let (s, a, s2) = (&data.observations, &data.actions, &data.next_observations);
+    // A row without a next state may be a copy, too.
+    let rows = Rows::join(&[(s, data.obs_dim), (a, data.act_dim), (s2, data.obs_dim)]);
     let mut row = vec![0f32; rows.dim()];
     let mut seen = HashSet::with_capacity(rows.len());
     // The hash has 64 bits: among two million different rows, a false match has probability 1e-7.

@@ -8,6 +8,8 @@ use crate::Transitions;
 #[derive(Clone, Debug)]
 pub struct Rows<'a> {
     parts: Vec<(&'a [f32], usize)>,
+    /// The rows of the parts that are points; `None`: all of them.
+    taken: Option<Vec<usize>>,
     len: usize,
     dim: usize,
 }
@@ -29,12 +31,18 @@ impl<'a> Rows<'a> {
         };
         let len = parts.first().map_or(0, rows);
         assert!(parts.iter().all(|p| rows(p) == len), "the parts have different numbers of rows");
-        Self { parts: parts.to_vec(), len, dim: parts.iter().map(|p| p.1).sum() }
+        Self { parts: parts.to_vec(), taken: None, len, dim: parts.iter().map(|p| p.1).sum() }
     }
 
-    /// [s, a, s'], as in Eq. 9 and in OTDF.
+    /// [s, a, s'], as in Eq. 9 and in OTDF, of the rows whose s' is known: a row without s' is no such point.
     pub fn transitions(t: &'a Transitions) -> Self {
-        Self::join(&[(&t.observations, t.obs_dim), (&t.actions, t.act_dim), (&t.next_observations, t.obs_dim)])
+        let all =
+            Self::join(&[(&t.observations, t.obs_dim), (&t.actions, t.act_dim), (&t.next_observations, t.obs_dim)]);
+        if t.known.iter().all(|&known| known) {
+            return all;
+        }
+        let taken: Vec<usize> = (0..t.len()).filter(|&i| t.known[i]).collect();
+        Self { len: taken.len(), taken: Some(taken), ..all }
     }
 
     /// [s, s'], the state transitions of Eq. 8.
@@ -59,6 +67,7 @@ impl<'a> Rows<'a> {
 
     /// Copies row `i` into `out` (`[dim]`).
     pub fn copy_row(&self, i: usize, out: &mut [f32]) {
+        let i = self.taken.as_ref().map_or(i, |taken| taken[i]);
         let mut at = 0;
         for &(data, d) in &self.parts {
             out[at..at + d].copy_from_slice(&data[i * d..(i + 1) * d]);
@@ -93,5 +102,16 @@ mod tests {
         rows.copy_rows(1..3, &mut out);
         assert_eq!(out, [3.0, 4.0, 20.0, 5.0, 6.0, 30.0]);
         assert_eq!(rows.to_vec(), [1.0, 2.0, 10.0, 3.0, 4.0, 20.0, 5.0, 6.0, 30.0]);
+    }
+
+    #[test]
+    fn a_row_without_a_successor_is_no_point() {
+        let mut t = Transitions::new(1, 1);
+        (0..4).for_each(|i| t.push(&[i as f32], &[0.5], 0.0, &[i as f32 + 1.0], i == 1, false));
+        assert_eq!(Rows::transitions(&t).len(), 4);
+        t.known[1] = false;
+        let rows = Rows::transitions(&t);
+        assert_eq!((rows.len(), rows.dim()), (3, 3));
+        assert_eq!(rows.to_vec(), [0.0, 0.5, 1.0, 2.0, 0.5, 3.0, 3.0, 0.5, 4.0]);
     }
 }

@@ -24,9 +24,9 @@ pub struct RunFolder {
     pub machine: String,
     /// One member each.
     pub members: Vec<Member>,
-    /// Seconds from data to scores, without stages that were there already.
+    /// Seconds from data to scores, of all attempts, without stages that were there already.
     pub seconds: f64,
-    /// Seconds of learning and evaluation, all members.
+    /// Seconds of learning and evaluation, of all attempts and all members.
     pub learning_seconds: f64,
     /// Rows that joined the target rows.
     pub extra_rows: u64,

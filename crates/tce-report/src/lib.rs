@@ -23,6 +23,7 @@ pub mod error;
 pub mod folder;
 pub mod html;
 pub mod merge;
+mod numbers;
 pub mod paper;
 pub mod permutation;
 pub mod record;
@@ -36,8 +37,8 @@ pub use analysis::{Analysis, Options, analyse};
 pub use diagnosis::page as diagnosis_page;
 pub use error::{ReportError, Result};
 pub use folder::RunFolder;
-pub use merge::{Kin, merge, mixed};
-pub use study::{Budget, Change, Cost, Method, Missing, Recipe, Recommended, Run, Study};
+pub use merge::{merge, mixed};
+pub use study::{Budget, Change, Cost, Method, Missing, Recipe, Recommended, Run, Study, Work};
 
 use std::path::{Path, PathBuf};
 

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use tce_data::Task;
 
 use crate::folder::Verdict;
-use crate::study::{Method, Missing, Run, Study};
+use crate::study::{Method, Missing, Run, Study, Work};
 
 /// All of `studies` as one, in their order. A run that several of them have counts once. Where they differ about a run of the same
 /// settings and data, the first one counts, and the difference is a conflict. Where studies have different settings for a method and task,
@@ -46,28 +46,6 @@ struct Merging {
     joined: usize,
     /// Methods that have another id than in their study, because that was taken: as they were, and the new id.
     renamed: Vec<(Method, String)>,
-}
-
-/// What makes two runs the same work.
-#[derive(PartialEq, Eq, PartialOrd, Ord)]
-struct Work {
-    task: Task,
-    method: String,
-    seed: u64,
-    settings: String,
-    inputs: BTreeMap<String, String>,
-}
-
-impl Work {
-    fn of(run: &Run) -> Self {
-        Self {
-            task: run.task,
-            method: run.method.clone(),
-            seed: run.member.seed,
-            settings: run.settings(),
-            inputs: run.folder.inputs.clone(),
-        }
-    }
 }
 
 /// The column of `method` for the runs of the study `name`.
@@ -163,7 +141,7 @@ impl Merging {
 
     /// Adds a run of study `number`, unless it is there.
     fn add(&mut self, run: Run, number: usize) {
-        let at = match self.places.entry(Work::of(&run)) {
+        let at = match self.places.entry(run.work()) {
             Entry::Occupied(known) => *known.get(),
             Entry::Vacant(new) => {
                 new.insert(self.out.runs.len());
@@ -197,7 +175,7 @@ impl Merging {
     /// Where runs of one method and task are different work, all runs of the method with the same `mark` are a column of their own. A mark is
     /// made from a run and the number of its study. The columns are called after the studies that they are from.
     fn split(&mut self, by: &str, mark: impl Fn(&Run, usize) -> String) {
-        for id in mixed(self.out.runs.iter().map(|r| (r.task, r.method.as_str(), Kin::of(r)))) {
+        for id in mixed(self.out.runs.iter().map(Run::work)) {
             let at = self.out.methods.iter().position(|m| m.id == id).expect("every run has a method");
             let method = self.out.methods.remove(at);
             // The runs of every mark, in the order of the studies.
@@ -232,33 +210,16 @@ impl Merging {
     }
 }
 
-/// What runs have in common that are seeds of one work, and the seed.
-pub struct Kin<'a> {
-    /// Their settings.
-    pub settings: String,
-    /// Their data.
-    pub inputs: &'a BTreeMap<String, String>,
-    /// The seed.
-    pub seed: u64,
-}
-
-impl<'a> Kin<'a> {
-    /// Of a run.
-    pub fn of(run: &'a Run) -> Self {
-        Self { settings: run.settings(), inputs: &run.folder.inputs, seed: run.member.seed }
-    }
-}
-
-/// The names of which some task has runs that are no seeds of one work: they have other settings or other data, or a seed is there twice.
-pub fn mixed<'a>(runs: impl IntoIterator<Item = (Task, &'a str, Kin<'a>)>) -> BTreeSet<String> {
-    let mut seen: BTreeMap<(Task, &str), (Kin, BTreeSet<u64>)> = BTreeMap::new();
+/// The methods of which some task has runs that are no seeds of one work: they have other settings or other data, or a seed is there twice.
+pub fn mixed(runs: impl IntoIterator<Item = Work>) -> BTreeSet<String> {
+    let mut seen: BTreeMap<(Task, String), (Work, BTreeSet<u64>)> = BTreeMap::new();
     let mut mixed = BTreeSet::new();
-    for (task, name, own) in runs {
-        let (settings, inputs, seed) = (own.settings.clone(), own.inputs, own.seed);
-        let (first, seeds) = seen.entry((task, name)).or_insert_with(|| (own, BTreeSet::new()));
-        let same = (&first.settings, first.inputs) == (&settings, inputs);
-        if !seeds.insert(seed) || !same {
-            mixed.insert(name.to_owned());
+    for work in runs {
+        let known = seen.entry((work.task, work.method.clone()));
+        let (first, seeds) = known.or_insert_with(|| (work.clone(), BTreeSet::new()));
+        let same = (&first.settings, &first.inputs) == (&work.settings, &work.inputs);
+        if !seeds.insert(work.seed) || !same {
+            mixed.insert(work.method);
         }
     }
     mixed

@@ -1,12 +1,13 @@
 //! Scores over a setting (Fig. 4, Table G.1): where a sweep's overrides are called NAME=NUMBER, they are points of a line.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use maud::{Markup, html};
 
 use crate::analysis::Analysis;
+use crate::html::parts::task_caption;
 use crate::html::words::term;
-use crate::study::{Method, Study, shift_title, short};
+use crate::study::{Method, Study};
 use crate::svg::{self, Axis, Frame, Line, Point, Scale, Series};
 
 /// Fewer values than this make no curve.
@@ -69,7 +70,6 @@ pub fn section(study: &Study, analysis: &Analysis) -> Option<Markup> {
         };
         all.iter().enumerate().filter_map(of).collect()
     };
-    let shifts: BTreeSet<_> = analysis.tables.iter().map(|t| t.shift).collect();
     Some(html! {
         p {
             "Scores when one setting is varied and the others stay. Lines are means over seeds, bands one standard deviation. Among the \
@@ -85,7 +85,7 @@ pub fn section(study: &Study, analysis: &Analysis) -> Option<Markup> {
                         @let xs = || lines.iter().flat_map(|l| &l.points).map(|p| p.x);
                         @let ys = || lines.iter().flat_map(|l| &l.points).flat_map(|p| [p.range().0, p.range().1]);
                         figure {
-                            figcaption { (short(&row.task)) @if shifts.len() > 1 { br; span { (shift_title(row.task.shift)) } } }
+                            (task_caption(analysis, &row.task))
                             (svg::lines(&Frame {
                                 label: &format!("score over {name}, {}", row.task),
                                 size: (320.0, 210.0),

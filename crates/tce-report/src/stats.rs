@@ -180,6 +180,16 @@ pub struct Estimate {
     pub interval: Option<(f64, f64)>,
 }
 
+impl Estimate {
+    /// `61.7 [57.2, 65.9]`, or without the interval where there is none.
+    pub fn told(&self, decimals: usize) -> String {
+        match self.interval {
+            Some((low, high)) => format!("{:.decimals$} [{low:.decimals$}, {high:.decimals$}]", self.point),
+            None => format!("{:.decimals$}", self.point),
+        }
+    }
+}
+
 /// What is drawn anew.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Draw {

@@ -1,5 +1,6 @@
 //! What a report is about: methods, their runs, and what is missing.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 
@@ -163,6 +164,34 @@ impl Run {
     pub fn settings(&self) -> String {
         self.recipe.settings(&self.folder)
     }
+
+    /// The work that it is the result of.
+    pub fn work(&self) -> Work {
+        Work::of(self.task, &self.method, self.member.seed, &self.recipe, &self.folder)
+    }
+}
+
+/// What makes two runs the same work; without the seed, what makes them seeds of one work.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Work {
+    /// The task.
+    pub task: Task,
+    /// The method's id.
+    pub method: String,
+    /// The seed.
+    pub seed: u64,
+    /// What tells the settings from others ([`Recipe::settings`]).
+    pub settings: String,
+    /// The data.
+    pub inputs: BTreeMap<String, String>,
+}
+
+impl Work {
+    /// That of `method` with `seed`, whose run is in `folder`.
+    pub fn of(task: Task, method: &str, seed: u64, recipe: &Recipe, folder: &RunFolder) -> Self {
+        let (settings, inputs) = (recipe.settings(folder), folder.inputs.clone());
+        Self { task, method: method.to_owned(), seed, settings, inputs }
+    }
 }
 
 /// A planned or begun run without a result.
@@ -187,7 +216,7 @@ pub struct Cost {
     pub stage: String,
     /// The robot.
     pub agent: Agent,
-    /// Seconds on the clock.
+    /// Seconds on the clock, of all attempts.
     pub seconds: f64,
     /// Seeds that were done side by side in this time.
     pub seeds: usize,

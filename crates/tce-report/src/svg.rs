@@ -109,13 +109,6 @@ fn short(text: &str, most: usize) -> String {
     text.chars().take(first).chain(['…']).chain(text.chars().skip(count - last)).collect()
 }
 
-fn spoken(e: &Estimate, decimals: usize) -> String {
-    match e.interval {
-        Some((low, high)) => minus(format!("{:.decimals$} [{low:.decimals$}, {high:.decimals$}]", e.point)),
-        None => minus(format!("{:.decimals$}", e.point)),
-    }
-}
-
 /// Dots with intervals, one row each; `mark` is a value to compare with, drawn as a dashed line. Names stand before their rows, or above them
 /// where one of them is too long for that.
 pub fn intervals(
@@ -147,7 +140,7 @@ pub fn intervals(
             @for (k, row) in rows.iter().enumerate() {
                 @let y = top + high * k as f64 + dot;
                 g class=(format!("mark {}", row.series.class)) {
-                    title { (row.series.title) ": " (spoken(&row.inner, decimals)) }
+                    title { (row.series.title) ": " (minus(row.inner.told(decimals))) }
                     @if above {
                         text class="name" x=(n(left)) y=(n(y - 13.0)) { (short(&row.series.title, 60)) }
                     } @else {

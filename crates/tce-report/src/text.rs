@@ -1,7 +1,8 @@
 //! The report's tables as Markdown and as LaTeX.
 
+use tce_base::counted;
+
 use crate::analysis::{Analysis, Cell, ShiftTable, opening};
-use crate::stats::Estimate;
 use crate::study::{Study, shift_title, short};
 
 /// A table: a header, and rows of as many cells. The first column is text.
@@ -13,13 +14,6 @@ struct Table {
     rules: Vec<usize>,
     /// What a reader has to know of it.
     doubt: Option<String>,
-}
-
-fn estimate(e: &Estimate, decimals: usize) -> String {
-    match e.interval {
-        Some((low, high)) => format!("{:.decimals$} [{low:.decimals$}, {high:.decimals$}]", e.point),
-        None => format!("{:.decimals$}", e.point),
-    }
 }
 
 fn title(analysis: &Analysis, m: usize) -> String {
@@ -49,7 +43,7 @@ fn shift_table(analysis: &Analysis, t: &ShiftTable) -> Table {
     let of = |n: usize| if n < t.rows.len() { format!(" (of {n} tasks)") } else { String::new() };
     let ours_total = t.totals.iter().map(|x| match x {
         None => "–".into(),
-        Some(x) => format!("{}{}", estimate(&x.estimate, 1), of(x.tasks)),
+        Some(x) => format!("{}{}", x.estimate.told(1), of(x.tasks)),
     });
     let paper_total = t.paper_totals.iter().map(|(sum, n)| match n {
         0 => "–".to_owned(),
@@ -74,9 +68,9 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
     let rows = c.methods.iter().map(|a| {
         let [iqm, median, mean, gap] = a.over_seeds;
         let mut row = vec![title(analysis, a.method), a.runs.to_string()];
-        row.extend([iqm, mean, median, gap, a.total].iter().map(|e| estimate(e, 1)));
+        row.extend([iqm, mean, median, gap, a.total].iter().map(|e| e.told(1)));
         match &a.over_baselines {
-            Some(over) => row.extend(over.iter().map(|e| estimate(e, 2))),
+            Some(over) => row.extend(over.iter().map(|e| e.told(2))),
             None => row.extend(c.baselines.iter().map(|_| "–".into())),
         }
         row.push(c.gap(a).map_or("–".into(), |gap| format!("{gap:+.1}")));
@@ -88,9 +82,8 @@ fn statistics(analysis: &Analysis) -> Option<Table> {
         });
         row
     });
-    let n = c.tasks.len();
     Some(Table {
-        title: format!("Statistics over {n} task{}", if n == 1 { "" } else { "s" }),
+        title: format!("Statistics over {}", counted(c.tasks.len(), "task", "tasks")),
         header,
         rows: rows.collect(),
         rules: Vec::new(),

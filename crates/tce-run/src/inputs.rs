@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::Serialize;
+use tce_base::counted;
 use tce_data::{
     ActionRange, Agent, Choice, ReferenceScores, ScoreTable, Shift, Task, Transitions, choose_trajectories,
     ensure_same_agent, infer_agents, reference_scores,
@@ -131,7 +132,8 @@ impl Inputs {
                 let range = range_of(given, rows[0].act_dim, &self.target.file).map_err(Error::Usage)?;
                 let outside: usize = rows.iter().map(|t| range.outside(&t.actions)).sum();
                 if outside > 0 {
-                    tce_base::note!("warning: {outside} action values lie outside of --action-range {range}");
+                    let outside = counted(outside, "action value lies", "action values lie");
+                    tce_base::note!("warning: {outside} outside of --action-range {range}");
                 }
                 Some(range)
             }
@@ -273,15 +275,6 @@ impl Inputs {
         }
     }
 
-    /// The target rows that the learner of `config` learns from: models of the dynamics cannot use a terminal row without a successor.
-    pub fn taught(&self, config: &Config) -> Arc<Transitions> {
-        let rows = match config.learner.algorithm.about().successors {
-            true => self.imitated(&config.target),
-            false => self.learned_from(&config.target),
-        };
-        Arc::new(rows.into_owned())
-    }
-
     /// [`Inputs::spec`] of work that sees the imitated rows alone.
     pub fn spec_imitated(&self, domains: Domains, config: &TargetConfig) -> InputSpec {
         let chosen = self.choice(config).map(|c| format!("the better trajectories, {} rows", c.rows.len()));
@@ -318,8 +311,9 @@ impl Inputs {
         let known: usize = tables().map(|t| terminal(&t.rows)).sum();
         if self.agent.is_none() && all > 0 && known == 0 {
             tce_base::note!(
-                "warning: {all} rows are terminal, and none of them has a next state: no generated or imagined episode will end early. \
-                 Record the state in which an episode ends as `next_observations`"
+                "warning: {}, and none has a next state: no generated or imagined episode will end early. \
+                 Record the state in which an episode ends as `next_observations`",
+                counted(all, "row is terminal", "rows are terminal")
             );
         }
     }

@@ -23,6 +23,7 @@
 //! ```
 
 pub mod augment;
+mod clock;
 pub mod config;
 pub mod course;
 pub mod device_kind;

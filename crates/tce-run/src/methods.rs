@@ -25,7 +25,7 @@ pub fn build(
     config.own().build(&on)?.ok_or_else(Error::interrupted)
 }
 
-/// One score per row of `others`, for learners that choose rows by scores; a higher score is closer to the target. None for other
+/// One score per row of `others` whose s' is known, for learners that choose rows by scores; a higher score is closer to the target. None for other
 /// learners.
 ///
 /// # Errors
@@ -36,7 +36,7 @@ pub fn row_scores(config: &Config, target: &Transitions, others: &Transitions) -
         RowScores::Transport => Some(negated_costs(transport_costs(&rows, &near, &TransportOptions::default())?)),
         RowScores::Density => {
             let options = &config.single_stage.scores;
-            enough_to_score(others.len(), target.len(), options)?;
+            enough_to_score(rows.len(), near.len(), options)?;
             Some(Arc::new(density_scores(&rows, &near, options, &score_streams())?.source))
         }
         RowScores::None => None,

@@ -26,8 +26,8 @@ use crate::error::{Error, Result};
 use crate::inputs::{Domains, Inputs};
 use crate::stage::Stage;
 
-/// The rows of a mixture that are not target rows, per member; `None` for target rows alone. `source_scores` are numbers of all
-/// source rows.
+/// The rows of a mixture that are not target rows, per member; `None` for target rows alone. `source_scores` are numbers of
+/// all source rows whose s' is known.
 pub fn extra_rows(
     inputs: &Inputs,
     config: &Config,
@@ -41,11 +41,8 @@ pub fn extra_rows(
     let selected: Option<Vec<ScoredRows>> = match mixture.source {
         SourceRows::None => None,
         SourceRows::All => {
-            let rows = match config.learner.algorithm.about().successors {
-                true => inputs.source_rows()?,
-                false => inputs.source()?.complete(),
-            };
-            let all = ScoredRows { rows: Arc::new(rows.clone()), scores: source_scores };
+            let rows = Arc::new(inputs.source()?.complete().clone());
+            let all = ScoredRows { rows, scores: source_scores };
             Some(vec![all; seeds.len()])
         }
         SourceRows::Relabelled => {

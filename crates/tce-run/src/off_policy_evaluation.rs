@@ -41,7 +41,7 @@ use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::stage::Stage;
 
 mod places;
-use places::{NEAR, bounds, distances, median, source_starts, spacing, spreads, starts};
+use places::{TargetStates, bounds, episode_starts, median, source_starts, starts};
 
 /// Share of the target rows that the ensemble does not see.
 const HELD_OUT: f64 = 0.05;
@@ -62,6 +62,8 @@ pub struct OffPolicyEvaluator {
     root: PathBuf,
     inputs: InputSpec,
     target: Arc<Transitions>,
+    /// Its states, to which distances are measured.
+    target_states: TargetStates,
     /// With the terminal rows whose s' nobody knows: values do not need it.
     complete: Arc<Transitions>,
     /// The states in which imagined episodes begin.
@@ -73,7 +75,6 @@ pub struct OffPolicyEvaluator {
     whole: bool,
     /// The units of the policies' actions, where they are not the box.
     actions: Option<ActionRange>,
-    spacing: f64,
     /// The reward of a step outside of the models' range.
     worst: f64,
 }
@@ -143,10 +144,10 @@ impl OffPolicyEvaluator {
         let longest = complete.episodes().iter().map(|e| e.end - e.start).max().unwrap_or(1);
         // Rows in no order do not tell how long an episode is.
         let limit = if inputs.target.has_episodes() { Some(longest) } else { inputs.step_limit() };
-        let spacing = spacing(target)?;
+        let target_states = TargetStates::of(target)?;
         let mut first = target.select(&starts(target)).observations;
         if let Some(source) = inputs.source.as_ref().filter(|s| s.has_episodes()) {
-            first.extend(source_starts(&source.rows, target, NEAR * spacing)?);
+            first.extend(source_starts(&source.rows, &target_states)?);
         }
         Ok(Self {
             dynamics,
@@ -154,10 +155,10 @@ impl OffPolicyEvaluator {
             stage,
             root: root.to_owned(),
             inputs: inputs.spec(Domains::Target),
-            spacing,
             starts: first,
             worst: worst_reward(target),
             target: target.clone(),
+            target_states,
             complete,
             low,
             high,
@@ -198,7 +199,7 @@ impl OffPolicyEvaluator {
         let mut alive = vec![vec![true; lanes]; networks];
         let mut returns = vec![vec![0.0; lanes]; networks];
         let mut steps = vec![vec![0usize; lanes]; networks];
-        let mut visited = Transitions::new(width, 1);
+        let mut visited: Vec<f32> = Vec::new();
         // The episode of every visited state, with its return and steps up to there.
         let mut passed: Vec<(usize, Left)> = Vec::new();
         let mut left: Vec<Option<Left>> = vec![None; networks * lanes];
@@ -232,7 +233,7 @@ impl OffPolicyEvaluator {
                     if !inside {
                         left[episode] = Some(here);
                     } else if step % 10 == 0 {
-                        visited.push(next, &[0.0], 0.0, next, false, true);
+                        visited.extend_from_slice(next);
                         passed.push((episode, here));
                     }
                 }
@@ -245,7 +246,7 @@ impl OffPolicyEvaluator {
                 }
             }
         }
-        let distances = if visited.is_empty() { Vec::new() } else { distances(&visited, t, &spreads(t))? };
+        let distances = if visited.is_empty() { Vec::new() } else { self.target_states.distances(&visited)? };
         let (returns, steps) = (returns.concat(), steps.concat());
         let left = self.left(left, &distances, &passed);
         let count = |(whole, left): (&f64, &Option<Left>)| left.map_or(*whole, |l| l.counted(self.worst, self.limit));
@@ -261,7 +262,7 @@ impl OffPolicyEvaluator {
             supported_return: mean_std(&supported).0,
             survival: share(steps.iter().sum()),
             support: share(known),
-            distance: if visited.is_empty() { f64::INFINITY } else { median(distances) / self.spacing },
+            distance: if visited.is_empty() { f64::INFINITY } else { median(distances) / self.target_states.spacing },
             action_error: rmse(&actions, &t.actions),
             returns,
             supported,
@@ -275,7 +276,7 @@ impl OffPolicyEvaluator {
     fn left(&self, mut left: Vec<Option<Left>>, distances: &[f32], passed: &[(usize, Left)]) -> Vec<Option<Left>> {
         for (&distance, &(episode, here)) in distances.iter().zip(passed) {
             let earlier = left[episode].is_none_or(|l| here.steps < l.steps);
-            if earlier && f64::from(distance) > FAR * self.spacing {
+            if earlier && f64::from(distance) > FAR * self.target_states.spacing {
                 left[episode] = Some(here);
             }
         }
@@ -310,7 +311,7 @@ impl OffPolicyEvaluator {
             complete_rows: Option<usize>,
         }
         let t = &self.complete;
-        let starts: Vec<usize> = t.episodes().iter().map(|e| e.start).collect();
+        let starts = episode_starts(t);
         let first = t.select(&starts).observations;
         let actions = |policy: &Policy| PolicyActions {
             next: self.actions_at(policy, &t.next_observations),

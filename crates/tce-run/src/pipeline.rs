@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig};
@@ -41,7 +40,7 @@ pub struct Summary {
     pub extra_rows: usize,
     /// The generated rows, per member; empty if there are none.
     pub generated: Vec<Generated>,
-    /// Seconds from data to scores, without stages that were finished before.
+    /// Seconds from data to scores, without stages that were finished before. Interrupted attempts count up to their last checkpoint.
     pub seconds: f64,
     /// The directory of the run.
     pub directory: PathBuf,
@@ -193,7 +192,6 @@ pub fn run(
         tce_base::note!("{name}: done before, in {}", stage.directory().display());
         return Ok(summary);
     }
-    let started = Instant::now();
     tce_base::note!("{name}: {}", stage.directory().display());
     let attempt = stage.attempt()?;
     write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
@@ -238,7 +236,7 @@ pub fn run(
         learned,
         extra_rows: extra_count,
         generated: reports,
-        seconds: started.elapsed().as_secs_f64(),
+        seconds: attempt.seconds(),
         directory: stage.directory().to_owned(),
         data: inputs.files(),
     };
@@ -255,7 +253,7 @@ pub fn run(
 
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
-    let target = inputs.taught(config);
+    let target = Arc::new(inputs.learned_from(&config.target).into_owned());
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
         // Generated rows are no trajectories.

@@ -17,6 +17,7 @@ use tce_nn::{Checkpoints, Device, is_cpu};
 use tce_sim::SimError;
 use tce_zoo::actors::{Actions, Arena, Evaluation, evaluate};
 
+use crate::clock::{self, Clock};
 use crate::config::{Algorithm, EvaluationConfig, LearnerConfig};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
@@ -32,7 +33,7 @@ pub struct MemberData {
     pub target: Arc<Transitions>,
     /// Source or generated rows.
     pub extra: Option<Arc<Transitions>>,
-    /// One number per row of `extra`, for algorithms that weigh or filter these rows.
+    /// One number per row of `extra` whose s' is known, for algorithms that weigh or filter these rows.
     pub row_scores: Option<Arc<Vec<f32>>>,
     /// Tables with real trajectories, whose returns the reward scale is taken from.
     pub trajectories: Vec<Arc<Transitions>>,
@@ -61,7 +62,7 @@ pub struct Learned {
     /// Means of the learner's metrics over its last report, per member; None is a number that is not finite.
     #[serde(alias = "figures")]
     pub metrics: BTreeMap<String, Vec<Option<f64>>>,
-    /// Seconds of training.
+    /// Seconds of training and evaluation. Interrupted attempts count up to their last checkpoint.
     pub seconds: f64,
     /// The device that computed it.
     #[serde(default)]
@@ -79,6 +80,7 @@ impl Learned {
 #[must_use]
 pub struct Leftovers<'a> {
     checkpoints: Checkpoints,
+    clock: Clock,
     place: Place<'a>,
 }
 
@@ -86,6 +88,7 @@ impl Leftovers<'_> {
     /// Removes the checkpoints. Call it when the results are on disk: an interruption before that costs no training.
     pub fn discard(self) {
         self.checkpoints.remove();
+        self.clock.forget();
         self.place.discard_preparations();
     }
 }
@@ -102,7 +105,7 @@ pub fn learn<'a>(
     device: &Device,
     keep: impl FnOnce(&[Policy]) -> Result<()>,
 ) -> Result<(Learned, Leftovers<'a>)> {
-    let started = std::time::Instant::now();
+    let clock = Clock::start(directory.join(format!("learner.{}", clock::SUFFIX)));
     let rows = LearnedRows::with(data.iter().find_map(|d| d.extra.as_ref()));
     let config = &LearnerConfig { steps: config.steps(rows), ..config.clone() };
     let journal = Journal::default();
@@ -162,10 +165,10 @@ pub fn learn<'a>(
             metrics.log("evaluate", updates, m, e.score.map(|s| ("score", s)))?;
         }
     }
-    learned.seconds = started.elapsed().as_secs_f64();
+    learned.seconds = clock.seconds();
     // Its metrics are written.
     let place = Place { directory: Some(directory), key, job: 0, journal: None };
-    Ok((learned, Leftovers { checkpoints, place }))
+    Ok((learned, Leftovers { checkpoints, clock, place }))
 }
 
 /// A report of `stage` on members `first` and following.

@@ -23,6 +23,7 @@ use tce_base::{
 };
 use tce_nn::{Checkpoints, Device};
 
+use crate::clock::{self, Clock};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
 
@@ -171,7 +172,8 @@ impl Stage {
             }
         }
         fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
-        Ok(Attempt { stage: self.clone(), name, directory })
+        let clock = Clock::start(directory.join(format!("attempt.{}", clock::SUFFIX)));
+        Ok(Attempt { stage: self.clone(), name, directory, clock })
     }
 }
 
@@ -181,6 +183,7 @@ pub struct Attempt {
     stage: Stage,
     name: String,
     directory: PathBuf,
+    clock: Clock,
 }
 
 impl Attempt {
@@ -197,6 +200,11 @@ impl Attempt {
     /// The hash of the specification, which checkpoints and chunks of this stage carry.
     pub fn key(&self) -> &str {
         &self.stage.key
+    }
+
+    /// Seconds that the stage took so far, with earlier attempts up to their last checkpoint.
+    pub fn seconds(&self) -> f64 {
+        self.clock.seconds()
     }
 
     /// The checkpoints of the training `name`.
@@ -255,6 +263,7 @@ impl Attempt {
             }
             self.stage.discard(&self.name);
         }
+        self.clock.finish();
         Ok(())
     }
 }
@@ -262,7 +271,9 @@ impl Attempt {
 /// The time of the last change below `directory`.
 fn newest(directory: &Path) -> SystemTime {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
-    let times = entries.filter_map(|e| e.metadata().and_then(|m| m.modified()).ok());
+    // Seconds are noted before anything is done.
+    let work = entries.filter(|e| e.path().extension().is_none_or(|e| e != clock::SUFFIX));
+    let times = work.filter_map(|e| e.metadata().and_then(|m| m.modified()).ok());
     times.max().unwrap_or(SystemTime::UNIX_EPOCH)
 }
 
@@ -276,16 +287,23 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
             if entry.file_type()?.is_dir() {
                 all(&entry.path(), &to)?;
             } else if !entry.file_name().to_string_lossy().ends_with(".part") {
-                match fs::copy(entry.path(), to) {
+                match fs::copy(entry.path(), &to) {
+                    Ok(_) => keep_time(&entry, &to),
                     // Its owner is at work and has replaced or removed it.
-                    Err(e) if e.kind() != ErrorKind::NotFound => return Err(e),
-                    _ => {}
+                    Err(e) if e.kind() == ErrorKind::NotFound => {}
+                    Err(e) => return Err(e),
                 }
             }
         }
         Ok(())
     }
     all(from, to).inspect_err(|_| drop(fs::remove_dir_all(to)))
+}
+
+/// Gives the copy `to` the time of its original: the times of checkpoints tell how long an attempt took.
+fn keep_time(from: &fs::DirEntry, to: &Path) {
+    let time = from.metadata().and_then(|m| m.modified());
+    let _ = time.and_then(|time| fs::File::options().append(true).open(to)?.set_modified(time));
 }
 
 /// SHA-256 of the files of the finished stage in `directory`, as its `done.json` lists them.
@@ -300,6 +318,8 @@ pub fn files_of(directory: &Path) -> Result<BTreeMap<String, String>> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     fn stage(root: &Path, spec: u32) -> Stage {
@@ -353,6 +373,27 @@ mod tests {
         drop(attempt);
         assert_eq!(s.summary::<u32>().unwrap(), Some(7));
         assert!(s.file("rows").exists());
+    }
+
+    #[test]
+    fn a_stage_counts_earlier_attempts_up_to_their_last_checkpoint() {
+        let root = tempfile::tempdir().unwrap();
+        let s = stage(root.path(), 1);
+        let first = s.attempt().unwrap();
+        // After 500 seconds it was noted two hours ago; the last checkpoint is an hour old.
+        for (name, content, hours) in [("attempt.seconds", "{\"seconds\":500}", 2), ("labels.1.checkpoint", "state", 1)]
+        {
+            fs::write(first.file(name), content).unwrap();
+            let time = SystemTime::now() - Duration::from_secs(3600 * hours);
+            fs::File::options().append(true).open(first.file(name)).unwrap().set_modified(time).unwrap();
+        }
+        // It may still run somewhere: its state and its times are copied.
+        let next = s.attempt().unwrap();
+        assert!(next.file("labels.1.checkpoint").exists());
+        let seconds = next.seconds();
+        assert!((4100.0..4160.0).contains(&seconds), "{seconds}");
+        make(next, b"data").unwrap();
+        assert!(!s.file("attempt.seconds").exists(), "it is no result");
     }
 
     #[test]

@@ -403,9 +403,10 @@ fn verdicts(sweep: &Sweep, notes: &mut Vec<String>) -> Vec<Recommended> {
         out.extend(verdict_of(entry.task, &sweep.directory.join(outcome.place).join("verdict.json"), among, notes));
     }
     if missing > 0 {
-        notes.push(format!(
-            "Recommendations of {missing} tasks and seeds are not made yet, or their files were changed."
-        ));
+        notes.push(match missing {
+            1 => "The recommendation of one task and seed is not made yet, or its files were changed.".into(),
+            n => format!("The recommendations of {n} tasks and seeds are not made yet, or their files were changed."),
+        });
     }
     out
 }

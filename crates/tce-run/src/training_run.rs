@@ -14,6 +14,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use tce_base::{first_damaged, read_if_there, read_json, sha256_files, sha256_hex, write_json};
@@ -219,13 +220,11 @@ impl TrainingRun<'_> {
 
     /// What every seed learns from.
     fn members(&self, inputs: &Inputs) -> Result<Vec<MemberData>> {
-        let target = inputs.taught(self.config);
-        let complete = !self.config.learner.algorithm.about().successors;
+        let target = Arc::new(inputs.learned_from(&self.config.target).into_owned());
         if let Some(choice) = inputs.choice(&self.config.target) {
             tce_base::note!("{}", choice.reason);
         }
-        let rows = |table: &Table| if complete { table.all_rows() } else { table.rows.clone() };
-        let extra = inputs.extra.as_ref().map(rows);
+        let extra = inputs.extra.as_ref().map(Table::all_rows);
         let row_scores = match &extra {
             Some(extra) => row_scores(self.config, &target, extra)?,
             None => None,

@@ -3,6 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use tce_base::counted;
+
 use super::formats::{Columns, Raw};
 use super::hdf5::{Column, Hdf5};
 use super::options::LoadOptions;
@@ -162,7 +164,10 @@ impl Together {
         ];
         self.warnings.extend(told.into_iter().flatten());
         if empty > 0 {
-            self.warnings.push(format!("{empty} episodes without a step were left out"));
+            self.warnings.push(format!(
+                "{} left out",
+                counted(empty, "episode without a step was", "episodes without a step were")
+            ));
         }
         if options.all_columns || !options.columns.is_empty() {
             self.warnings.push(

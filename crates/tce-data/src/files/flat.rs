@@ -8,6 +8,7 @@
 //! | `next_observations` | (N, D), may be absent | `next_obs`, `next_states` |
 //! | `terminals` | (N,) or (N, 1) | `terminations`, `terminated`, `terminal` |
 //! | `timeouts` | (N,) or (N, 1), may be absent | `truncations`, `truncated`, `truncateds`, `timeout`, `infos/timeouts` |
+//! | `known` | (N,) or (N, 1), may be absent: 0 at terminal rows whose s' was not logged | `next_observations_known` |
 
 use std::collections::BTreeMap;
 
@@ -29,6 +30,8 @@ const REWARDS: [&str; 2] = ["rewards", "reward"];
 const NEXT: [&str; 3] = ["next_observations", "next_obs", "next_states"];
 const TERMINALS: [&str; 4] = ["terminals", "terminations", "terminated", "terminal"];
 const TIMEOUTS: [&str; 6] = ["timeouts", "truncations", "truncated", "truncateds", "timeout", "infos/timeouts"];
+/// The marks of successors that are known, in files that others write from a table's columns. Ours call them [`KNOWN`].
+const MARKS: &str = "known";
 /// Fields that mark ends of episodes without saying whether they are terminals or time-outs.
 const ANY_END: [&str; 5] = ["dones", "done", "dones_float", "episode_terminals", "ends"];
 /// Fields that may mark ends of episodes and are not read.
@@ -42,6 +45,42 @@ fn name<'a>(file: &Hdf5, names: &[&'a str], warnings: &mut Vec<String>) -> Optio
         warnings.push(format!("no `{}`: `{found}` was read as such", names[0]));
     }
     Some(found)
+}
+
+/// Whether [`save_d4rl`](super::save_d4rl) wrote this file.
+fn is_ours(file: &Hdf5) -> Result<bool, DataError> {
+    Ok(file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT))
+}
+
+/// Which successors are known, if the file says so, and the field that says it. A field [`MARKS`] that is no such mark is
+/// a column of the user's own: it is told, and stays one.
+fn marks(
+    file: &Hdf5,
+    terminals: &[bool],
+    beside: Beside<'_>,
+    warnings: &mut Vec<String>,
+) -> Result<Option<(&'static str, Vec<bool>)>, DataError> {
+    if file.has(KNOWN) {
+        return Ok(Some((KNOWN, file.flags(KNOWN, beside)?)));
+    }
+    if !file.has(MARKS) || is_ours(file)? {
+        return Ok(None);
+    }
+    let (found, expected) = match file.flags(MARKS, beside) {
+        Ok(known) if known.len() != beside.rows => {
+            (format!("{} rows", known.len()), format!("{} rows, as in `{}`", beside.rows, beside.field))
+        }
+        Ok(known) => match known.iter().zip(terminals).position(|(&known, &terminal)| !known && !terminal) {
+            None => return Ok(Some((MARKS, known))),
+            Some(row) => (format!("0 in row {row}, which is no terminal"), "0 at terminal rows alone".to_owned()),
+        },
+        Err(DataError::Invalid { found, expected, .. }) => (found, expected),
+        Err(error) => return Err(error),
+    };
+    warnings.push(format!(
+        "`{MARKS}` was not read as marks of next states that were not logged: found {found}; expected {expected}"
+    ));
+    Ok(None)
 }
 
 /// Fields that may mark ends of episodes and were not read in addition to `timeouts`.
@@ -84,16 +123,10 @@ impl Format for Flat {
         let (acted, rewarded) = (file.matrix(actions)?, file.vector(rewards, beside)?);
         let terminal = file.flags(terminals, beside)?;
         let timeout = timeouts.map(|name| file.flags(name, beside)).transpose()?;
-        let mut known = if file.has(KNOWN) { Some(file.flags(KNOWN, beside)?) } else { None };
-        let columns = further(
-            file,
-            options,
-            &[observations, actions, rewards, terminals],
-            next,
-            timeouts,
-            beside,
-            &mut warnings,
-        )?;
+        let told = marks(file, &terminal, beside, &mut warnings)?;
+        let fields = [observations, actions, rewards, terminals, told.as_ref().map_or(KNOWN, |told| told.0)];
+        let columns = further(file, options, &fields, next, timeouts, beside, &mut warnings)?;
+        let mut known = told.map(|told| told.1);
 
         let mut counts = vec![(actions, acted.rows), (rewards, rewarded.rows), (terminals, terminal.len())];
         counts.extend(next.zip(stored.as_ref()).map(|(name, c)| (name, c.rows)));
@@ -119,8 +152,7 @@ impl Format for Flat {
         for (name, c) in [(observations, &observed), (actions, &acted), (rewards, &rewarded)] {
             warnings.extend(told_losses(name, &c.losses, &c.data, c.dim));
         }
-        let trusted = file.attributes()?.get(FORMAT_ATTRIBUTE).is_some_and(|f| f == FORMAT);
-        let layout = match (trusted, &stored, &timeout) {
+        let layout = match (is_ours(file)?, &stored, &timeout) {
             (true, Some(_), Some(_)) => Layout::Tce,
             _ => layout_of(stored.is_some(), timeout.is_some()),
         };
@@ -162,7 +194,7 @@ fn further(
         columns.insert(name.clone(), file.vector(name, beside)?.data);
     }
     if options.all_columns {
-        let read = |name: &str| fields.contains(&name) || next == Some(name) || timeouts == Some(name) || name == KNOWN;
+        let read = |name: &str| fields.contains(&name) || next == Some(name) || timeouts == Some(name);
         let (rows, mut left_out) = (beside.rows, Vec::new());
         for name in file.all_datasets()?.into_iter().filter(|name| !read(name)) {
             match file.vector(&name, beside) {

@@ -10,8 +10,8 @@ pub(super) fn layout_of(successors: bool, timeouts: bool) -> Layout {
     }
 }
 
-/// Replaces successors that are not finite by the state and marks them as not `known`. Only terminal rows may have such
-/// successors. Returns their number.
+/// Marks successors that are not finite as not `known`, and replaces all that are not known by the state. Only terminal
+/// rows may have such successors. Returns the number of those that are not finite.
 ///
 /// # Errors
 /// The first such row that is not terminal.
@@ -29,10 +29,11 @@ pub(super) fn fill_gaps(
     }
     if !gaps.is_empty() {
         let known = known.get_or_insert_with(|| vec![true; terminals.len()]);
-        for &i in &gaps {
-            known[i] = false;
-            next[row(i)].copy_from_slice(&observations[row(i)]);
-        }
+        gaps.iter().for_each(|&i| known[i] = false);
+    }
+    let lost = |i: &usize| terminals[*i] && known.as_ref().is_some_and(|known| !known[*i]);
+    for i in (0..terminals.len()).filter(lost) {
+        next[row(i)].copy_from_slice(&observations[row(i)]);
     }
     Ok(gaps.len())
 }

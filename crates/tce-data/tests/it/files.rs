@@ -2,8 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use crate::common::{Rows, load, rebuilt, rows, write};
-use tce_data::{Dropped, EpisodeEnds, Layout, LoadOptions, Successors, Transitions, read_attributes, save_d4rl};
+use crate::common::{Rows, benchmark, enum_flags, load, rebuilt, rows, write};
+use hdf5_pure::FileBuilder;
+use tce_data::{
+    Dropped, EpisodeEnds, Layout, LoadOptions, Loaded, Successors, Transitions, read_attributes, save_d4rl,
+};
 
 fn starts_and_ends(t: &Transitions) -> Vec<(usize, usize)> {
     t.episodes().iter().map(|e| (e.start, e.end)).collect()
@@ -95,6 +98,76 @@ fn d4rl_with_right_successors_keeps_every_row() {
     assert_eq!(got.transitions.next_observation(6), [200.0, -7.0]);
 }
 
+/// Ten rows, of which row 3 is terminal, with what `add` adds to their file; all further columns are read.
+fn with_field(name: &str, add: &dyn Fn(&mut FileBuilder)) -> Loaded {
+    let dir = tempfile::tempdir().unwrap();
+    let mut r = rows(10);
+    (r.terminals[3], r.timeouts[6]) = (true, true);
+    (r.next[3 * 2], r.next[6 * 2]) = (-70.0, 200.0);
+    let mut b = r.with_next(r.d4rl());
+    add(&mut b);
+    tce_data::load(&write(&dir, name, b), &LoadOptions { all_columns: true, ..benchmark() }).unwrap()
+}
+
+/// `true` in all of `n` rows but one.
+fn all_but(row: usize, n: usize) -> Vec<bool> {
+    (0..n).map(|i| i != row).collect()
+}
+
+/// A file that someone wrote from the columns of a table: `known` is 0 at a terminal whose s' was not logged.
+#[test]
+fn the_field_known_marks_successors_that_were_not_logged() {
+    let numbers: Vec<f32> = all_but(3, 10).into_iter().map(f32::from).collect();
+    let column = |b: &mut FileBuilder| {
+        b.create_dataset("known").with_f32_data(&numbers).with_shape(&[10, 1]);
+    };
+    for got in [
+        with_field("flags.hdf5", &|b| enum_flags(b, "known", &all_but(3, 10))),
+        with_field("column.hdf5", &column),
+        with_field("ours.hdf5", &|b| enum_flags(b, "next_observations_known", &all_but(3, 10))),
+    ] {
+        let t = &got.transitions;
+        assert_eq!((&t.known, got.report.unknown_successors), (&all_but(3, 10), 1));
+        assert_eq!(t.next_observation(3), t.observation(3), "what stood there is nobody's s'");
+        assert_eq!(starts_and_ends(t), [(0, 4), (4, 7), (7, 10)]);
+        assert!(got.columns.is_empty(), "{:?}", got.columns);
+    }
+}
+
+#[test]
+fn a_column_known_of_ones_own_is_told_and_stays_a_column() {
+    let read = |name: &str, words: &str, add: &dyn Fn(&mut FileBuilder)| {
+        let got = with_field(name, add);
+        assert_eq!((got.report.unknown_successors, got.transitions.next_observation(3)[0]), (0, -70.0));
+        let told: Vec<&String> = got.report.warnings.iter().filter(|w| w.starts_with("`known` was not read")).collect();
+        assert!(told.len() == 1 && told[0].contains(words), "{:?}", got.report.warnings);
+        got.columns.contains_key("known")
+    };
+    let numbers: Vec<f32> = (0..10).map(|i| i as f32).collect();
+    let counts = |b: &mut FileBuilder| {
+        b.create_dataset("known").with_f32_data(&numbers);
+    };
+    let wide = |b: &mut FileBuilder| {
+        b.create_dataset("known").with_u8_data(&[1; 20]).with_shape(&[10, 2]);
+    };
+    assert!(read("counts.hdf5", "found 2 in row 2; expected 0 or 1", &counts));
+    assert!(read("elsewhere.hdf5", "found 0 in row 5, which is no terminal", &|b| {
+        enum_flags(b, "known", &all_but(5, 10));
+    }));
+    assert!(!read("short.hdf5", "found 9 rows; expected 10 rows, as in `observations`", &|b| {
+        enum_flags(b, "known", &all_but(3, 9));
+    }));
+    assert!(!read("wide.hdf5", "found shape [10, 2]; expected shape (N,) or (N, 1)", &wide));
+
+    // A file of ours has its marks under another name.
+    let (dir, got) = (tempfile::tempdir().unwrap(), with_field("plain.hdf5", &|_| {}));
+    let path = dir.path().join("ours.hdf5");
+    save_d4rl(&path, &got.transitions, &BTreeMap::new(), &[("known", &numbers[..])]).unwrap();
+    let again = tce_data::load(&path, &LoadOptions { all_columns: true, ..benchmark() }).unwrap();
+    assert_eq!((&again.transitions, &again.columns["known"]), (&got.transitions, &numbers));
+    assert!(again.report.warnings.is_empty(), "{}", again.report);
+}
+
 #[test]
 fn d4rl_with_rebuilt_successors_is_read_as_if_they_were_absent() {
     let dir = tempfile::tempdir().unwrap();
@@ -112,7 +185,7 @@ fn d4rl_with_rebuilt_successors_is_read_as_if_they_were_absent() {
 fn without_timeouts_and_successors_steps_are_counted() {
     let dir = tempfile::tempdir().unwrap();
     let r = rows(2100);
-    let mut b = hdf5_pure::FileBuilder::new();
+    let mut b = FileBuilder::new();
     b.create_dataset("observations").with_f32_data(&r.observations).with_shape(&[2100, 2]);
     b.create_dataset("actions").with_f32_data(&r.actions).with_shape(&[2100, 1]);
     b.create_dataset("rewards").with_f32_data(&r.rewards);
@@ -131,7 +204,7 @@ fn every_storage_type_gives_the_same_rows() {
     r.next[20 * 2] = 0.25;
     let want = load(&write(&dir, "0.hdf5", r.otdf())).unwrap().transitions;
     let base = |wide: bool, column: bool| {
-        let mut b = hdf5_pure::FileBuilder::new();
+        let mut b = FileBuilder::new();
         for (name, data, d) in [
             ("observations", &r.observations, 2),
             ("next_observations", &r.next, 2),
@@ -170,7 +243,7 @@ fn every_storage_type_gives_the_same_rows() {
     b.create_dataset("terminals").with_u8_data(&flags(&r));
     assert_eq!(load(&write(&dir, "3.hdf5", b)).unwrap().transitions, want);
     let mut b = base(true, true);
-    crate::common::enum_flags(&mut b, "terminals", &r.terminals);
+    enum_flags(&mut b, "terminals", &r.terminals);
     assert_eq!(load(&write(&dir, "4.hdf5", b)).unwrap().transitions, want);
 }
 
@@ -181,14 +254,14 @@ fn doubles_that_lose_their_steps_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let read = |step: f64| {
         let state = |i: u32| [f64::from(i).sin(), 5.4e6 + step * f64::from(i)];
-        let mut b = hdf5_pure::FileBuilder::new();
+        let mut b = FileBuilder::new();
         for (name, later) in [("observations", 0), ("next_observations", 1)] {
             let states: Vec<f64> = (0..200).flat_map(|i| state(i + later)).collect();
             b.create_dataset(name).with_f64_data(&states).with_shape(&[200, 2]);
         }
         b.create_dataset("actions").with_f64_data(&[0.5; 200]).with_shape(&[200, 1]);
         b.create_dataset("rewards").with_f64_data(&[1.0; 200]);
-        crate::common::enum_flags(&mut b, "terminals", &[false; 200]);
+        enum_flags(&mut b, "terminals", &[false; 200]);
         load(&write(&dir, "far.hdf5", b)).unwrap().report.warnings.join("\n")
     };
     let told = read(0.01);

@@ -256,7 +256,7 @@ fn episodes_without_a_step_are_left_out() {
     }
     let got = load(&write(&dir, "empty.hdf5", b), &LoadOptions::default()).unwrap();
     assert_eq!((got.report.rows_kept, got.transitions.episodes().len()), (6, 2));
-    assert!(got.report.to_string().contains("1 episodes without a step were left out"), "{}", got.report);
+    assert!(got.report.to_string().contains("1 episode without a step was left out"), "{}", got.report);
 }
 
 /// Groups in groups, in many episodes: every number comes from its own one. A clock far from zero is told once.

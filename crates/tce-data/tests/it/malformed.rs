@@ -247,7 +247,7 @@ fn actions_outside_of_the_box_are_a_warning() {
     let of =
         |agent| check(&got.transitions, agent).findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
     let text = of(Some(Agent::Hopper));
-    assert!(text.contains("warning: actions: 1 values lie outside") && text.contains("row 5"), "{text}");
+    assert!(text.contains("warning: actions: 1 value lies outside") && text.contains("row 5"), "{text}");
     assert!(of(None).contains("note: actions: they range over -1.5:"), "{}", of(None));
 }
 

@@ -58,7 +58,6 @@ const ABOUT: About = About {
     published: None,
     table: "bc",
     needs: OtherRows::Any,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

@@ -27,7 +27,7 @@ use crate::buffer::{Buffer, Member};
 use crate::error::LearnError;
 use crate::labels::rmse;
 use crate::policy::{Policy, PolicyLearner};
-use crate::training::{Place, prepare};
+use crate::training::{Journal, Place, prepare};
 
 /// The dropout of clones that need it.
 pub const MUCH: f64 = 0.3;
@@ -41,8 +41,9 @@ const STEPS: u64 = 4_000;
 const FEWEST: usize = 250;
 
 /// The dropout of every member of `buffer`, whose clones are trained for `steps` steps. It depends on the member's target rows and their
-/// standardisation, and on nothing else: members of different seeds have the same. `clones` makes clones of the members of a buffer, with
-/// a rate each, for so many steps. `None` if the user interrupted it.
+/// standardisation, and on nothing else: members of different seeds have the same. What a job of the journal of `place` has found out is
+/// not tried again for the same rows. `clones` makes clones of the members of a buffer, with a rate each, for so many steps. `None` if the
+/// user interrupted it.
 ///
 /// # Errors
 /// Those of `clones`, and if a checkpoint cannot be read or written.
@@ -53,17 +54,15 @@ pub(super) fn chosen<L: PolicyLearner>(
     device: &Device,
     clones: impl Fn(&Buffer, Vec<f64>, u64) -> Result<L, LearnError>,
 ) -> Result<Option<Vec<f64>>, LearnError> {
-    let members = buffer.members();
+    let (members, journal) = (buffer.members(), place.journal);
     // The metrics of these clones are not the members'.
     let place = Place { journal: None, ..place };
     let steps = STEPS.min(steps.div_ceil(12));
     let mut rates: Vec<f64> = Vec::with_capacity(members.len());
     for (m, member) in members.iter().enumerate() {
-        let same = |other: &Member| {
-            Arc::ptr_eq(&other.parts[0], &member.parts[0]) && other.standardizer == member.standardizer
-        };
-        let rate = match members[..m].iter().position(same) {
-            Some(earlier) => rates[earlier],
+        let here = members[..m].iter().position(|other| same(other, member)).map(|earlier| rates[earlier]);
+        let rate = match here.or_else(|| journal.and_then(|journal| found(journal, member))) {
+            Some(rate) => rate,
             None if member.parts[0].len() < FEWEST => 0.0,
             None => {
                 let folds = Folds::of(member);
@@ -73,12 +72,27 @@ pub(super) fn chosen<L: PolicyLearner>(
                 if !prepare(&mut learner, &rows, steps, &label, place, device)? {
                     return Ok(None);
                 }
-                told(&learner.policies(), &folds.unseen)
+                let rate = told(&learner.policies(), &folds.unseen);
+                if let Some(journal) = journal {
+                    journal.dropout.lock().expect("no job has panicked").push((member.clone(), rate));
+                }
+                rate
             }
         };
         rates.push(rate);
     }
     Ok(Some(rates))
+}
+
+/// Whether two members have the same target rows in the same units.
+fn same(a: &Member, b: &Member) -> bool {
+    (Arc::ptr_eq(&a.parts[0], &b.parts[0]) || a.parts[0] == b.parts[0]) && a.standardizer == b.standardizer
+}
+
+/// What a job has found out about the rows of `member`.
+fn found(journal: &Journal, member: &Member) -> Option<f64> {
+    let dropout = journal.dropout.lock().expect("no job has panicked");
+    dropout.iter().find(|(other, _)| same(other, member)).map(|(_, rate)| *rate)
 }
 
 /// Two members for each fold of a member's target rows, without dropout and with it, and the rows that they do not see.

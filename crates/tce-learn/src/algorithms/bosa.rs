@@ -59,7 +59,6 @@ const ABOUT: About = About {
     published: Some("critics bootstrap at terminal rows and nowhere else"),
     table: "bosa",
     needs: OtherRows::Source,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

@@ -50,7 +50,6 @@ const ABOUT: About = About {
     published: Some("the classifiers' softmax is taken for logits, by their loss and by the rewards"),
     table: "dara",
     needs: OtherRows::Source,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

@@ -19,7 +19,9 @@
 //!
 //! The modes do not differ in anything else.
 //!
-//! Terminal rows whose s' is unknown (logs without next states) are left out of all tables: without s' they have no score.
+//! Where s' is unknown, at terminal rows of logs without next states, there is no score: the row borrows that of another
+//! source or generated row of the batch (`lend_scores` in [`crate::selection`]). The scores of the others are those of
+//! rows with s' alone.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -33,7 +35,7 @@
 use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
-use crate::buffer::{Buffer, Member, Minibatch};
+use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
@@ -41,7 +43,7 @@ use crate::mode::Mode;
 use crate::on_iql::{BatchTransform, OnIql};
 use crate::otdf::otdf_policy;
 use crate::regulariser::{Regulariser, RegulariserConfig};
-use crate::selection::{Selected, need_scores, scores_of_others};
+use crate::selection::{Scores, Selected};
 use crate::training::Meter;
 
 const ABOUT: About = About {
@@ -52,7 +54,6 @@ const ABOUT: About = About {
     published: Some("OTDF's broadcast, and a behaviour model that is never trained"),
     table: "dmc",
     needs: OtherRows::Scored,
-    successors: true,
     episodes: false,
     scores: RowScores::Density,
 };
@@ -123,7 +124,7 @@ pub type Dmc = OnIql<Scored>;
 /// Keeps the rows with the highest scores.
 pub struct Scored {
     config: DmcConfig,
-    members: Vec<Member>,
+    scores: Scores,
 }
 
 impl Dmc {
@@ -141,9 +142,9 @@ impl Dmc {
         device: &Device,
     ) -> Result<Self, LearnError> {
         config.check()?;
-        need_scores("DmC", buffer.members())?;
+        let scores = Scores::new("DmC", buffer)?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(OnIql { iql, transform: Scored { config: config.clone(), members: buffer.members().to_vec() } })
+        Ok(OnIql { iql, transform: Scored { config: config.clone(), scores } })
     }
 }
 
@@ -155,7 +156,7 @@ impl BatchTransform for Scored {
         _step: u64,
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>) {
-        let scores = scores_of_others(&self.members, batch);
+        let scores = self.scores.of_others(batch);
         Selected::new(batch, &scores, 1.0 - self.config.cut_off, |score| score).recorded(meter)
     }
 }

@@ -53,7 +53,6 @@ const ABOUT: About = About {
     ),
     table: "igdf",
     needs: OtherRows::Source,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

@@ -53,7 +53,6 @@ const ABOUT: About = About {
     published: None,
     table: "iql",
     needs: OtherRows::Any,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

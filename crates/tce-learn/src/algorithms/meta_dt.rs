@@ -6,7 +6,9 @@
 //! L_π = mean over steps and action dimensions of (π_t - a_t)²                → DT
 //! ```
 //!
-//! Half of a member's segments are from the target, half from the source ([`crate::sequences`]). Terminal rows whose s' is unknown are left out, as the world model needs it.
+//! Half of a member's segments are from the target, half from the source ([`crate::sequences`]). Where s' is unknown, at
+//! terminal rows of logs without next states, the world model does not see the row. The transformer does: it needs s, a
+//! and the rewards, and a context is of steps before its own.
 //!
 //! | symbol | field | default | source |
 //! |---|---|---|---|
@@ -54,7 +56,6 @@ const ABOUT: About = About {
     published: None,
     table: "meta_dt",
     needs: OtherRows::Any,
-    successors: true,
     episodes: true,
     scores: RowScores::None,
 };
@@ -187,7 +188,8 @@ impl MetaDt {
     /// New networks for the members of `buffer`. The world models are trained here. `None` if interrupted.
     ///
     /// # Errors
-    /// If the configuration cannot be used, or a checkpoint at `place` cannot be read or written.
+    /// If the configuration cannot be used, the s' of no row of a table is known, or a checkpoint at `place` cannot be read
+    /// or written.
     pub fn new(
         buffer: &Buffer,
         config: &MetaDtConfig,
@@ -196,8 +198,9 @@ impl MetaDt {
     ) -> Result<Option<Self>, LearnError> {
         config.check()?;
         let c = &config.world_model;
-        let mut worlds = Worlds::new(buffer, c, device);
-        if !prepare(&mut worlds, buffer, c.steps, "Meta-DT world model", place, device)? {
+        let known = buffer.clone().with_successors()?;
+        let mut worlds = Worlds::new(&known, c, device);
+        if !prepare(&mut worlds, &known, c.steps, "Meta-DT world model", place, device)? {
             return Ok(None);
         }
         let trainable = device.clone().autodiff();

@@ -34,10 +34,6 @@ pub struct About {
     pub table: &'static str,
     /// Requirements on the rows other than the target's.
     pub needs: OtherRows,
-    /// Whether it needs s' of every row, so that terminal rows whose s' is unknown are left out. A method whose models need
-    /// s', but whose critics do not, says no, and keeps these rows from its models.
-    #[serde(skip)]
-    pub successors: bool,
     /// Whether it uses episodes, so that rows must be in order.
     #[serde(skip)]
     pub episodes: bool,

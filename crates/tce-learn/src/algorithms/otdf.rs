@@ -14,7 +14,7 @@
 //! | β_reg | `beta_reg` | .5 | OTDF for morph and gravity; .1 for kinematic |
 //! | - | `mode` | corrected | published: every row is cloned with the mean weight of its batch |
 //! | β and its CVAE | `learner.behaviour` | - | [`crate::regulariser`], kind `otdf` |
-//! | d | `row_scores` of a [`crate::Member`] | - | a number per source row |
+//! | d | `row_scores` of a [`crate::Member`] | - | a number per source row with s' |
 //! | everything else | `learner.iql` | - | OTDF's IQL, but for what the preset changes in it (below) |
 //!
 //! **Published**: the code multiplies a column of weights by a row of losses. The result is filtered cloning with a
@@ -24,8 +24,9 @@
 //! tenth of these weights are 100, so their mean is 10 or more. The preset `default` uses exp(u / std u), with a mean
 //! of 1.2 to 1.5. There the same β_reg constrains the policy several times more. `--preset paper` has OTDF's scale.
 //!
-//! Terminal rows whose s' is unknown (logs without next states) are left out of both tables: without s' they have no cost
-//! of transport.
+//! Where s' is unknown, at terminal rows of logs without next states, there is no cost of transport: the row borrows that
+//! of another source row of the batch (`lend_scores` in [`crate::selection`]). The costs of the others are those of rows
+//! with s' alone.
 //!
 //! OTDF's loader also uses the next row as s' across the ends of episodes; this is not repeated here.
 
@@ -33,14 +34,14 @@ use serde::{Deserialize, Serialize};
 use tce_nn::{Device, Tensor};
 
 use crate::actor::ActionReduction;
-use crate::buffer::{Buffer, Member, Minibatch};
+use crate::buffer::{Buffer, Minibatch};
 use crate::error::{LearnError, within};
 use crate::iql::{Iql, IqlConfig, PolicyExtraction};
 use crate::method::{About, Built, Method, OtherRows, RowScores, Setup};
 use crate::mode::Mode;
 use crate::on_iql::{BatchTransform, OnIql};
 use crate::regulariser::{Regulariser, RegulariserKind};
-use crate::selection::{Selected, need_scores, scores_of_others};
+use crate::selection::{Scores, Selected};
 use crate::training::Meter;
 
 const ABOUT: About = About {
@@ -51,7 +52,6 @@ const ABOUT: About = About {
     published: Some("advantages have no effect on which action is cloned (a broadcast)"),
     table: "otdf",
     needs: OtherRows::Source,
-    successors: true,
     episodes: false,
     scores: RowScores::Transport,
 };
@@ -128,7 +128,7 @@ pub type Otdf = OnIql<Transported>;
 /// Keeps the source rows with a low cost of transport.
 pub struct Transported {
     config: OtdfConfig,
-    members: Vec<Member>,
+    scores: Scores,
 }
 
 impl Otdf {
@@ -145,9 +145,9 @@ impl Otdf {
         device: &Device,
     ) -> Result<Self, LearnError> {
         config.check()?;
-        need_scores("OTDF", buffer.members())?;
+        let scores = Scores::new("OTDF", buffer)?;
         let iql = Iql::new(buffer, &config.backbone(iql), regulariser, steps, device)?;
-        Ok(OnIql { iql, transform: Transported { config: config.clone(), members: buffer.members().to_vec() } })
+        Ok(OnIql { iql, transform: Transported { config: config.clone(), scores } })
     }
 }
 
@@ -169,7 +169,7 @@ impl BatchTransform for Transported {
         meter: &mut Meter,
     ) -> (Minibatch, Option<Tensor<3>>) {
         let c = &self.config;
-        let mut d = scores_of_others(&self.members, batch);
+        let mut d = self.scores.of_others(batch);
         normalise(&mut d, batch.s.dims()[1] - batch.target_rows);
         Selected::new(batch, &d, c.keep, |d| if c.weighted { d.exp() } else { 1.0 }).recorded(meter)
     }

@@ -39,7 +39,6 @@ const ABOUT: About = About {
     published: None,
     table: "rebrac",
     needs: OtherRows::Any,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

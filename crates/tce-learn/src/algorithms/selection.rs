@@ -1,8 +1,10 @@
 //! Selection among the rows of a batch: IGDF, OTDF and DmC select source rows at every step.
 
+use std::sync::Arc;
+
 use tce_nn::{Tensor, host, tensor};
 
-use crate::buffer::Minibatch;
+use crate::buffer::{Buffer, Member, Minibatch, Pick};
 use crate::error::LearnError;
 use crate::losses::member_mean;
 use crate::training::Meter;
@@ -55,14 +57,45 @@ impl Selected {
     }
 }
 
-/// The members' `row_scores` for the rows of `batch` that are not target rows, sorted by member.
-pub fn scores_of_others(members: &[crate::Member], batch: &Minibatch) -> Vec<f32> {
-    let b = batch.s.dims()[1];
-    let of = |(member, picks): (&crate::Member, &[crate::Pick])| -> Vec<f32> {
-        let scores = member.row_scores.as_ref().expect("checked by `need_scores`");
-        picks[batch.target_rows..].iter().map(|pick| scores[pick.row as usize]).collect()
-    };
-    members.iter().zip(batch.picks.chunks(b)).flat_map(of).collect()
+/// The scores by which OTDF and DmC choose among the rows that are not target rows.
+pub(crate) struct Scores {
+    /// Tells whose s' is known.
+    buffer: Buffer,
+    /// Of every member, one number per row of part 1; 0 where s' is unknown.
+    of_rows: Vec<Arc<Vec<f32>>>,
+}
+
+impl Scores {
+    /// The `row_scores` of the members of `buffer`, which `method` needs.
+    ///
+    /// # Errors
+    /// If a member has no source rows, or not a finite number for each whose s' is known.
+    pub(crate) fn new(method: &str, buffer: &Buffer) -> Result<Self, LearnError> {
+        need_scores(method, buffer.members())?;
+        Ok(Self { buffer: buffer.clone(), of_rows: buffer.members().iter().filter_map(scores_of_rows).collect() })
+    }
+
+    /// The scores of the rows of `batch` that are not target rows, sorted by member; borrowed where s' is unknown.
+    pub(crate) fn of_others(&self, batch: &Minibatch) -> Vec<f32> {
+        let (first, b) = (batch.target_rows, batch.s.dims()[1]);
+        let of = |(scores, picks): (&Arc<Vec<f32>>, &[Pick])| -> Vec<f32> {
+            picks[first..].iter().map(|pick| scores[pick.row as usize]).collect()
+        };
+        let mut scores: Vec<f32> = self.of_rows.iter().zip(batch.picks.chunks(b)).flat_map(of).collect();
+        lend_scores(&self.buffer.known_from(batch, first), &mut scores, b - first);
+        scores
+    }
+}
+
+/// A number per row of part 1: the member's where s' is known, else 0.
+fn scores_of_rows(member: &Member) -> Option<Arc<Vec<f32>>> {
+    let (scores, known) = (member.row_scores.as_ref()?, &member.parts.get(1)?.known);
+    if scores.len() == known.len() {
+        return Some(scores.clone());
+    }
+    let mut next = scores.iter();
+    let of = |known: &bool| if *known { next.next().copied().unwrap_or_default() } else { 0.0 };
+    Some(Arc::new(known.iter().map(of).collect()))
 }
 
 /// Gives rows that cannot be scored, because their s' is not `known`, the score of the row before them, or of the last one
@@ -82,7 +115,7 @@ pub(crate) fn lend_scores(known: &[bool], scores: &mut [f32], others: usize) {
 }
 
 /// Returns an error for members without source rows, which `method` needs.
-pub(crate) fn need_others(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
+pub(crate) fn need_others(method: &str, members: &[Member]) -> Result<(), LearnError> {
     match members.iter().position(|m| m.parts.len() != 2 || m.parts[1].is_empty()) {
         None => Ok(()),
         Some(m) => Err(LearnError::invalid(
@@ -94,23 +127,20 @@ pub(crate) fn need_others(method: &str, members: &[crate::Member]) -> Result<(),
     }
 }
 
-fn m_parts(member: &crate::Member) -> usize {
+fn m_parts(member: &Member) -> usize {
     member.parts.iter().filter(|p| !p.is_empty()).count()
 }
 
-/// Returns an error for members without a score for every source row.
-pub(crate) fn need_scores(method: &str, members: &[crate::Member]) -> Result<(), LearnError> {
+/// Returns an error for members without a score for every source row whose s' is known.
+fn need_scores(method: &str, members: &[Member]) -> Result<(), LearnError> {
     need_others(method, members)?;
     for (m, member) in members.iter().enumerate() {
-        let found = member.row_scores.as_ref().map_or(0, |s| s.len());
-        if found != member.parts[1].len() || member.row_scores.iter().flat_map(|s| s.iter()).any(|s| !s.is_finite()) {
+        let (found, rows) = (member.row_scores.as_ref().map_or(0, |s| s.len()), member.scored_rows());
+        if found != rows || member.row_scores.iter().flat_map(|s| s.iter()).any(|s| !s.is_finite()) {
             return Err(LearnError::invalid(
                 format!("member {m}, row_scores"),
                 format!("{found} numbers"),
-                format!(
-                    "a finite number for each of the {} source rows: {method} chooses by it",
-                    member.parts[1].len()
-                ),
+                format!("a finite number for each of the {rows} source rows with a next state: {method} chooses by it"),
                 "compute them for these very rows",
             ));
         }
@@ -139,7 +169,7 @@ mod tests {
     fn rows_keep_their_weights() {
         let column = |v: &[f32]| tensor(v.to_vec(), [2, 5, 1], &tce_nn::cpu());
         let numbers: Vec<f32> = (0..10).map(|i| i as f32).collect();
-        let pick = |i: usize| crate::Pick { part: u32::from(i % 5 >= 2), row: i as u32 };
+        let pick = |i: usize| Pick { part: u32::from(i % 5 >= 2), row: i as u32 };
         let batch = Minibatch {
             s: column(&numbers),
             a: column(&numbers),
@@ -155,6 +185,37 @@ mod tests {
         assert_eq!(host(kept.batch.r.clone()), host(kept.batch.s2.clone()));
         assert_eq!(host(kept.weights), [1.0, 1.0, 5.0, 20.0, 1.0, 1.0, 30.0, 20.0]);
         assert_eq!((kept.batch.target_rows, kept.batch.picks[3].row), (2, 4));
+    }
+
+    /// The source rows 1 and 4 have no s', and so no number. That of another row is ten times its index.
+    #[test]
+    fn scores_stay_with_their_rows() {
+        let mut t = tce_data::Transitions::new(1, 1);
+        (0..6).for_each(|i| t.push(&[i as f32], &[0.0], 0.0, &[0.0], i == 1 || i == 4, false));
+        t.known = t.terminals.iter().map(|terminal| !terminal).collect();
+        let t = Arc::new(t);
+        let member = |scores: Vec<f32>| Member {
+            streams: tce_base::Streams::new(1),
+            parts: vec![t.clone(), t.clone()],
+            standardizer: tce_data::Standardizer::identity(1),
+            reward_scale: 1.0,
+            row_scores: Some(Arc::new(scores)),
+        };
+        let own = vec![0.0, 20.0, 30.0, 50.0];
+        let buffer = Buffer::new(vec![member(own.clone()), member(own.clone())], 200).unwrap();
+        let batch = buffer.sample(0, &tce_nn::cpu());
+        let scores = Scores::new("OTDF", &buffer).unwrap().of_others(&batch);
+        let others = batch.picks.chunks(200).flat_map(|picks| &picks[100..]);
+        assert_eq!(scores.len(), 200);
+        assert!(others.clone().any(|pick| pick.row == 1) && others.clone().any(|pick| pick.row == 4));
+        for (pick, score) in others.zip(scores) {
+            match pick.row {
+                1 | 4 => assert!(own.contains(&score), "borrowed {score}"),
+                row => assert_eq!(score, 10.0 * row as f32),
+            }
+        }
+        let error = Buffer::new(vec![member(vec![0.0; 6])], 200).unwrap_err().to_string();
+        assert!(error.contains("4, one per row of part 1 whose s' is known"), "{error}");
     }
 
     #[test]

@@ -47,7 +47,6 @@ const ABOUT: About = About {
     published: Some("the discriminator's logit is clamped where its odds are meant"),
     table: "srpo",
     needs: OtherRows::Any,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

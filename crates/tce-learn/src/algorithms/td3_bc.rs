@@ -37,7 +37,6 @@ const ABOUT: About = About {
     published: None,
     table: "td3_bc",
     needs: OtherRows::Any,
-    successors: false,
     episodes: false,
     scores: RowScores::None,
 };

@@ -33,9 +33,16 @@ pub struct Member {
     pub standardizer: Standardizer,
     /// Factor on every reward; 1 for no scaling, see [`return_range_scale`].
     pub reward_scale: f32,
-    /// One number per row of part 1, if an algorithm weighs or filters these rows: a transport cost, a score.
-    /// [`Minibatch::picks`] gives the indices of a batch's rows.
+    /// One number per row of part 1 whose s' is known, in their order, if an algorithm weighs or filters these rows: a
+    /// transport cost, a score. Both compare transitions (s, a, s').
     pub row_scores: Option<Arc<Vec<f32>>>,
+}
+
+impl Member {
+    /// Rows of part 1 whose s' is known: those that have a number in `row_scores`.
+    pub(crate) fn scored_rows(&self) -> usize {
+        self.parts.get(1).map_or(0, |part| part.known.iter().filter(|known| **known).count())
+    }
 }
 
 /// The data of all members, which have the same dimensions and batch size.
@@ -152,10 +159,10 @@ impl Buffer {
                 let expected = format!("{}", dims.0);
                 return Err(LearnError::invalid(field, member.standardizer.dim(), expected, "fit it on this data"));
             }
-            let rows = member.parts.get(1).map_or(0, |p| p.len());
+            let rows = member.scored_rows();
             if let Some(scores) = member.row_scores.as_ref().filter(|s| s.len() != rows) {
                 let (field, found) = (format!("member {k}, row_scores"), format!("{} numbers", scores.len()));
-                let expected = format!("{rows}, one per row of part 1");
+                let expected = format!("{rows}, one per row of part 1 whose s' is known");
                 return Err(LearnError::invalid(field, found, expected, "compute them for these rows"));
             }
             let live = member.parts.iter().filter(|p| !p.is_empty()).count();
@@ -198,6 +205,11 @@ impl Buffer {
             }
         }
         Ok(Self { successors: true, ..self })
+    }
+
+    /// Whether batches may hold row `i` of `part`, one of the parts.
+    pub(crate) fn draws(&self, part: &Transitions, i: usize) -> bool {
+        !self.successors || part.known[i]
     }
 
     /// Rows of each of `parts` in the batch of `step`.
@@ -281,7 +293,7 @@ impl Buffer {
             for (k, (part, &rows)) in member.parts.iter().zip(&split).enumerate() {
                 for _ in 0..rows {
                     let mut i = rng.random_range(0..part.len());
-                    while self.successors && !part.known[i] {
+                    while !self.draws(part, i) {
                         i = rng.random_range(0..part.len());
                     }
                     self.push(member, part.observation(i), &mut s);

@@ -2,7 +2,8 @@
 //!
 //! A segment consists of the K steps that end at a row drawn from a member's tables, cut at the start of the episode.
 //! This is what a policy knows when it acts. Half of the rows come from the target, half from the source, as in a
-//! [`Buffer`]. Member m draws the rows of step t from its stream `segments`, index t.
+//! [`Buffer`]. Where the buffer's batches hold only rows with s', only such rows end a segment. Member m draws the rows of
+//! step t from its stream `segments`, index t.
 //!
 //! | symbol | shape | meaning |
 //! |---|---|---|
@@ -106,7 +107,10 @@ impl Trajectories {
         let mut out = Segments::default();
         for (part, (table, rows)) in self.tables.iter().zip(split(batch, &of.parts)).enumerate() {
             for _ in 0..rows {
-                let row = rng.random_range(0..table.rows.len());
+                let mut row = rng.random_range(0..table.rows.len());
+                while !buffer.draws(&table.rows, row) {
+                    row = rng.random_range(0..table.rows.len());
+                }
                 table.push(buffer, member, row, [context, horizon], &mut out);
                 out.picks.push(Pick { part: part as u32, row: row as u32 });
             }
@@ -256,6 +260,21 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// The terminal row 4 has no s'. A buffer for models never draws it; the learner's does.
+    #[test]
+    fn a_row_without_a_successor_is_for_learners_alone() {
+        let mut log = ordered();
+        log.known[4] = false;
+        let member = Member { parts: vec![Arc::new(log)], ..buffer(3).members()[0].clone() };
+        let learners = Buffer::new(vec![member], 64).unwrap();
+        let models = learners.clone().with_successors().unwrap();
+        let trajectories = Trajectories::new(&learners.members()[0]);
+        let drawn = |buffer: &Buffer| trajectories.sample(buffer, 0, 7, [400, 1, H]);
+        assert!(drawn(&learners).picks.iter().any(|pick| pick.row == 4));
+        assert!(drawn(&models).picks.iter().all(|pick| pick.row != 4));
+        assert_eq!(drawn(&models).picks.len(), 400);
     }
 
     #[test]

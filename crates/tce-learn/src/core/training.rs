@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tce_base::{Progress, Streams, interrupted, random::fill_normal};
 use tce_nn::{Checkpoints, Device, NamedParameters, NetworkError, Tensor, host, on_threads_of, tensor};
 
-use crate::buffer::{Buffer, Minibatch};
+use crate::buffer::{Buffer, Member, Minibatch};
 use crate::error::LearnError;
 
 /// Metrics are computed every so many steps. More would cost time without changing their means. The number is a prime,
@@ -27,13 +27,18 @@ pub struct Place<'a> {
     pub key: &'a str,
     /// The index of the job among several parallel ones.
     pub job: usize,
-    /// Receives the metrics of preparations (training before the first step).
+    /// Receives the metrics of preparations (training before the first step), and what they tell of rows.
     pub journal: Option<&'a Journal>,
 }
 
-/// The metrics of preparations, from jobs that may run in parallel.
+/// What the preparations of the jobs of one call leave for the caller and for each other. Jobs may run in parallel.
 #[derive(Debug, Default)]
-pub struct Journal(Mutex<Vec<(usize, String, Report)>>);
+pub struct Journal {
+    /// Metrics.
+    reports: Mutex<Vec<(usize, String, Report)>>,
+    /// The dropout that the target rows of a member have told (`bc_dropout.rs`).
+    pub(crate) dropout: Mutex<Vec<(Member, f64)>>,
+}
 
 impl Journal {
     /// Job, training and report, sorted by jobs and steps, independent of the order in which they arrived.
@@ -41,7 +46,7 @@ impl Journal {
     /// # Panics
     /// If a job has panicked.
     pub fn take(&self) -> Vec<(usize, String, Report)> {
-        let mut reports = std::mem::take(&mut *self.0.lock().expect("no job has panicked"));
+        let mut reports = std::mem::take(&mut *self.reports.lock().expect("no job has panicked"));
         reports.sort_by_key(|(job, ..)| *job);
         reports
     }
@@ -100,7 +105,7 @@ pub fn prepare<L: Learner>(
     let training = label.replace(' ', "-").to_lowercase();
     let outcome = advance(&mut jobs, steps, label, &mut checkpoints, AtTheEnd::Keep, device, |_, report, _| {
         if let Some(journal) = place.journal {
-            let mut reports = journal.0.lock().expect("no job has panicked");
+            let mut reports = journal.reports.lock().expect("no job has panicked");
             reports.push((place.job, training.clone(), report.clone()));
         }
         Ok::<_, LearnError>(())

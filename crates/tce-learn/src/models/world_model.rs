@@ -187,7 +187,7 @@ pub struct Worlds {
 }
 
 impl Worlds {
-    /// New networks for the members of `buffer`.
+    /// New networks for the members of `buffer`, whose batches must hold only rows with s'.
     pub fn new(buffer: &Buffer, config: &WorldModelConfig, device: &Device) -> Self {
         let trainable = device.clone().autodiff();
         let adam = AdamConfig { max_norm: Some(config.grad_clip), ..AdamConfig::default() };

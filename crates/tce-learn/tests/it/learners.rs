@@ -13,8 +13,8 @@ use tce_learn::iql::{Iql, IqlConfig, PolicyExtraction};
 use tce_learn::losses::AdvantageScale;
 use tce_learn::regulariser::{Regulariser, RegulariserConfig, RegulariserKind};
 use tce_learn::{
-    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, LabelConfig, LearnError, Learner, Member, Meter, Method, Mode, Place,
-    Policy, PolicyLearner, Setup, best_trajectories, train_labels,
+    ActorConfig, Bc, BcConfig, Buffer, CloneLoss, Journal, LabelConfig, LearnError, Learner, Member, Meter, Method,
+    Mode, Place, Policy, PolicyLearner, Setup, best_trajectories, train_labels,
 };
 use tce_nn::{Checkpoints, cpu};
 
@@ -144,32 +144,49 @@ fn rows_of(of: impl Fn(&[f32], f32) -> f32) -> Arc<Transitions> {
     Arc::new(t)
 }
 
+/// The dropout of clones of `members` that are trained for `steps` steps at `place`.
+fn dropout_of(members: Vec<Member>, steps: u64, place: Place<'_>) -> Vec<f64> {
+    let config = BcConfig { dropout: OrAuto::Auto, ..BcConfig::default() };
+    let (buffer, device) = (Buffer::new(members, 64).unwrap(), cpu());
+    let (iql, behaviour) = (IqlConfig::paper(), RegulariserConfig::paper());
+    let on = Setup { buffer: &buffer, steps, iql: &iql, behaviour: &behaviour, place, device: &device };
+    let mut learner = config.build(&on).unwrap().expect("nobody interrupts");
+    let mut meter = Meter::always();
+    learner.update(&buffer.sample(0, &device), 0, &mut meter);
+    meter.take()["dropout"].clone()
+}
+
 #[test]
 fn the_data_tell_whether_clones_take_dropout() {
     let noisy = rows_of(|_, noise| 0.4 * noise);
     let exact = rows_of(|s, _| 0.5 * s[0]);
     let few = Arc::new(noisy.select(&(0..200).collect::<Vec<_>>()));
-    let config = BcConfig { dropout: OrAuto::Auto, ..BcConfig::default() };
-    let chosen = |members: Vec<Member>| {
-        let (buffer, device) = (Buffer::new(members, 64).unwrap(), cpu());
-        let (iql, behaviour) = (IqlConfig::paper(), RegulariserConfig::paper());
-        let on = Setup {
-            buffer: &buffer,
-            steps: 12_000,
-            iql: &iql,
-            behaviour: &behaviour,
-            place: Place::NONE,
-            device: &device,
-        };
-        let mut learner = config.build(&on).unwrap().expect("nobody interrupts");
-        let mut meter = Meter::always();
-        learner.update(&buffer.sample(0, &device), 0, &mut meter);
-        meter.take()["dropout"].clone()
-    };
+    let chosen = |members: Vec<Member>| dropout_of(members, 12_000, Place::NONE);
     let all = chosen(vec![member(1, &noisy, true), member(2, &exact, true), member(3, &noisy, true)]);
     assert_eq!(all, [0.3, 0.0, 0.3], "by the rows, whatever the seed");
     assert_eq!(chosen(vec![member(9, &exact, true)]), [0.0], "whoever the other members are");
     assert_eq!(chosen(vec![member(1, &few, true)]), [0.0], "too few rows to hold some out");
+}
+
+/// A trial leaves a checkpoint with the number of its job.
+#[test]
+fn jobs_with_the_same_rows_try_dropout_once() {
+    let (noisy, exact) = (rows_of(|_, noise| 0.4 * noise), rows_of(|s, _| 0.5 * s[0]));
+    let (directory, journal) = (tempfile::tempdir().unwrap(), Journal::default());
+    let tried = |job: usize| {
+        let of = |k: u32| directory.path().join(format!("prepare-choose-dropout-{job}.{k}.checkpoint"));
+        of(0).exists() || of(1).exists()
+    };
+    let chosen = |job: usize, rows: &Arc<Transitions>| {
+        let place = Place { directory: Some(directory.path()), key: "key", job, journal: Some(&journal) };
+        dropout_of(vec![member(job as u64, rows, true)], 600, place)
+    };
+    let first = chosen(0, &noisy);
+    // The second job has a copy of the rows.
+    assert_eq!(chosen(1, &Arc::new(Transitions::clone(&noisy))), first);
+    chosen(2, &exact);
+    assert_eq!([0, 1, 2].map(tried), [true, false, true]);
+    assert!(journal.take().is_empty(), "the metrics of the trials are nobody's");
 }
 
 #[test]
@@ -439,6 +456,30 @@ fn dmc_goes_on_from_its_state_and_refuses_rows_without_scores() {
     let rows = scored_member(1).parts[1].len();
     let bad = Member { row_scores: Some(Arc::new(vec![f32::NAN; rows])), ..scored_member(1) };
     assert!(error(bad).contains("a finite number for each"));
+}
+
+/// Every fifth row is terminal and without s', and has no score. What stands in the place of s' has no effect.
+#[test]
+fn dmc_learns_from_rows_without_a_successor() {
+    let log = |instead: f32| {
+        let mut t = Transitions::clone(&corridor());
+        for i in (4..t.len()).step_by(5) {
+            (t.terminals[i], t.timeouts[i], t.known[i]) = (true, false, false);
+            t.next_observations[i] = instead;
+        }
+        Arc::new(t)
+    };
+    let learned = |instead: f32| {
+        let rows = log(instead);
+        let scores = (0..rows.with_successors().len()).map(|i| 0.1 + (i % 9) as f32 / 10.0).collect();
+        let parts = vec![rows.clone(), rows.clone()];
+        let member = Member { parts, row_scores: Some(Arc::new(scores)), ..member(1, &rows, true) };
+        let buffer = Buffer::new(vec![member], 32).unwrap();
+        let mut dmc = new_dmc(&buffer, &DmcConfig::default(), 12).unwrap();
+        go(&mut dmc, &buffer, 0, 12);
+        dmc.state()
+    };
+    assert!(learned(0.0) == learned(50.0));
 }
 
 /// The best action is +1, the behaviour's mean is 0. Corrected mode finds it. Published mode clones the rows left by

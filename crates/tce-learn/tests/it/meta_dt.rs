@@ -157,6 +157,33 @@ fn the_bytes_do_not_depend_on_the_number_of_threads() {
     assert!(learn(1) == learn(3), "another number of threads gave other parameters");
 }
 
+/// Every third episode ends at a terminal without s'. The policy learns from these rows, and what stands in the place of s'
+/// has no effect.
+#[test]
+fn an_unknown_successor_has_no_effect() {
+    let log = |name: &str, instead: f32| {
+        let mut t = Transitions::clone(&corridor(name, 20));
+        for i in (STEPS - 1..t.len()).step_by(3 * STEPS) {
+            (t.terminals[i], t.timeouts[i], t.known[i]) = (true, false, false);
+            t.next_observations[i] = instead;
+        }
+        Arc::new(t)
+    };
+    let learned = |instead: f32| {
+        let parts = vec![log("target", instead), log("source", instead)];
+        let buffer = Buffer::new(vec![member(1, parts)], 2).unwrap();
+        let mut learner = prepared(&buffer, &small(20));
+        go(&mut learner, &buffer, 0, 10);
+        learner.state()
+    };
+    assert!(learned(0.0) == learned(50.0));
+    let mut none = Transitions::clone(&corridor("target", 20));
+    none.known.fill(false);
+    let buffer = Buffer::new(vec![member(1, vec![Arc::new(none)])], 2).unwrap();
+    let error = MetaDt::new(&buffer, &small(1), Place::NONE, &cpu()).err().expect("refused").to_string();
+    assert!(error.contains("member 0, part 0: found 300 rows without s'"), "{error}");
+}
+
 /// A table without an order of time is a table of one-step episodes.
 #[test]
 fn generated_rows_are_learned_from_too() {

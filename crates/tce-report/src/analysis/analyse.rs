@@ -5,6 +5,7 @@ use tce_data::{Shift, Task};
 
 use super::*;
 use super::{compare, effects, recipes, recommended, warnings};
+use crate::difference::Sample;
 
 /// The figures of `study`.
 ///
@@ -81,13 +82,6 @@ fn tasks_of(study: &Study) -> Vec<Task> {
     tasks
 }
 
-fn mean_std(values: &[f64]) -> (f64, Option<f64>) {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-    (mean, (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()))
-}
-
 fn shift_table(
     study: &Study,
     bootstrap: &Bootstrap,
@@ -102,16 +96,15 @@ fn shift_table(
     let methods = &study.methods;
     let mut rows = Vec::new();
     for &t in places {
-        let stats: Vec<Option<(f64, Option<f64>)>> =
-            scores[t].iter().map(|s| (!s.is_empty()).then(|| mean_std(s))).collect();
-        let best = stats.iter().flatten().map(|s| s.0).fold(f64::MIN, f64::max);
-        let baselines = stats.iter().zip(methods).filter(|(_, m)| m.baseline).filter_map(|(s, _)| s.map(|s| s.0));
+        let samples: Vec<Option<Sample>> = scores[t].iter().map(|s| Sample::of(s)).collect();
+        let best = samples.iter().flatten().map(|s| s.mean).fold(f64::MIN, f64::max);
+        let baselines = samples.iter().zip(methods).filter(|(_, m)| m.baseline).filter_map(|(s, _)| s.map(|s| s.mean));
         let baseline = baselines.reduce(f64::max);
-        let cell = |(k, stat): (usize, &Option<(f64, Option<f64>)>)| {
-            stat.map(|(mean, std)| Cell {
+        let cell = |(k, sample): (usize, &Option<Sample>)| {
+            sample.map(|Sample { mean, std, seeds }| Cell {
                 mean,
                 std,
-                seeds: scores[t][k].len(),
+                seeds,
                 diverged: by_task[t][k].iter().filter(|r| matches!(r.member.verdict, Verdict::Diverged(_))).count(),
                 best: mean >= best,
                 above_baselines: if methods[k].baseline { None } else { baseline.map(|f| mean > f) },
@@ -119,7 +112,7 @@ fn shift_table(
         };
         rows.push(Row {
             task: tasks[t],
-            cells: stats.iter().enumerate().map(cell).collect(),
+            cells: samples.iter().enumerate().map(cell).collect(),
             paper: paper.and_then(|p| p.row(&tasks[t])).map_or_else(|| vec![None; columns], <[_]>::to_vec),
         });
     }

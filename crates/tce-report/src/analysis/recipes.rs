@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use tce_base::counted;
 use tce_data::Shift;
 
 use super::ENOUGH_SEEDS;
@@ -111,7 +112,7 @@ pub fn doubt(study: &Study, shift: Shift) -> Option<String> {
         names.dedup();
         let preset = |n: String| if n.starts_with("settings") { n } else { format!("preset {n}") };
         let names: Vec<String> = names.into_iter().map(preset).collect();
-        let seeds = if fewest == 1 { "1 seed".to_owned() } else { format!("{fewest} seeds") };
+        let seeds = counted(fewest, "seed", "seeds");
         let ours = budgets(runs.iter().filter_map(|r| r.recipe.learner.as_ref()));
         let paper = budgets(runs.iter().filter_map(|r| r.recipe.paper.as_ref()));
         let ours = [Some(names.join(" and ")), ours, Some(seeds)].into_iter().flatten().collect::<Vec<_>>().join(", ");

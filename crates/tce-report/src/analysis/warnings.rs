@@ -2,15 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use tce_base::counted;
 use tce_data::Task;
 
 use super::{Aggregate, Comparison, DIVERGED, ENOUGH_SEEDS, Finding, Warning, gap_words};
 use crate::folder::Verdict;
 use crate::study::{Run, Study};
-
-fn plural(n: usize, one: &str, many: &str) -> String {
-    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
-}
 
 fn list<'a>(names: impl IntoIterator<Item = &'a str>) -> String {
     names.into_iter().collect::<Vec<_>>().join(", ")
@@ -83,7 +80,7 @@ fn of_runs(study: &Study, out: &mut Vec<Warning>) {
             format!(
                 "{} could not act to the end of {} evaluation: counted as {DIVERGED} points, a random policy's score, and marked † in \
                  the tables.",
-                plural(diverged.len(), "policy", "policies"),
+                counted(diverged.len(), "policy", "policies"),
                 if diverged.len() == 1 { "its" } else { "their" },
             ),
             diverged,
@@ -99,7 +96,7 @@ fn of_runs(study: &Study, out: &mut Vec<Warning>) {
     }
     let unscored = cases(&|r| (r.member.verdict == Verdict::Unscored).then(|| "no score".into()));
     if !unscored.is_empty() {
-        let n = plural(unscored.len(), "run has", "runs have");
+        let n = counted(unscored.len(), "run has", "runs have");
         warn(
             out,
             format!("{n} no score, for lack of reference returns or of a simulator, and are counted nowhere."),
@@ -207,7 +204,7 @@ fn of_comparison(study: &Study, tasks: &[Task], scores: &[Vec<Vec<f64>>], c: &Co
     if !c.left_out.is_empty() {
         let with_tasks = |m: &usize| {
             let count = scores.iter().filter(|t| !t[*m].is_empty()).count();
-            format!("{} ({})", title(*m), plural(count, "task", "tasks"))
+            format!("{} ({})", title(*m), counted(count, "task", "tasks"))
         };
         let names: Vec<String> = c.left_out.iter().map(with_tasks).collect();
         let names = list(names.iter().map(String::as_str));

@@ -1,13 +1,13 @@
 //! The λ that the data speak for, beside what was best in hindsight.
 
 use maud::{Markup, html};
+use tce_base::counted;
 use tce_data::Task;
 use tce_diagnosis::{Choice, Diagnosis};
 
-use super::numbers::plain;
 use crate::analysis::Analysis;
-use crate::html::parts::counted;
 use crate::html::words::term;
+use crate::numbers::plain;
 use crate::study::{Study, short};
 use crate::svg::minus;
 

@@ -1,13 +1,13 @@
 //! The tables of a diagnosis.
 
 use maud::{Markup, html};
+use tce_base::counted;
 use tce_diagnosis::advice::percent;
 use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{Bounds, Diagnosis, Implied};
 
-use super::numbers::{number, plain};
-use crate::html::parts::counted;
+use crate::numbers::{number, plain};
 use crate::svg::minus;
 
 /// Errors of implied actions in a table.

@@ -30,7 +30,8 @@ pub(super) fn cost(study: &Study) -> Markup {
     let paper = paper::runtime();
     html! {
         p {
-            "Times on the clock of single pieces of work, on whatever machine did them and whatever else ran there. Memory is the most \
+            "Times on the clock of single pieces of work, on whatever machine did them and whatever else ran there. Attempts that were \
+             interrupted count up to their last checkpoint. Memory is the most \
              that the process had at a time; where one process trained the networks and sampled from them, it stands with the sampling."
         }
         @if groups.is_empty() { p class="note" { "No stage has a time." } } @else {

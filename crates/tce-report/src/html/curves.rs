@@ -1,13 +1,14 @@
 //! Figures of training.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use maud::{Markup, html};
 use tce_data::Task;
 
+use super::parts::task_caption;
 use super::{classes, decades, term};
 use crate::analysis::Analysis;
-use crate::study::{Study, shift_title, short};
+use crate::study::Study;
 use crate::svg::{self, Axis, Frame, Line, Point, Scale, Series};
 
 /// Points of a curve; more would be finer than the pixels.
@@ -57,7 +58,6 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
     let positive = everything.iter().flat_map(|(_, l)| l).flat_map(|l| &l.points).all(|p| p.range().0 > 0.0);
     let losses = if positive { lines("learn/policy_loss", &f64::log10) } else { everything };
     let scale = if positive { Scale::Log } else { Scale::Linear };
-    let several = tasks.iter().map(|t| t.shift).collect::<BTreeSet<_>>().len() > 1;
     let panels = |figures: &[(Task, Vec<Line>)], y_unit: &str, scale: Scale| {
         html! {
             div class="panels small" {
@@ -66,10 +66,7 @@ pub(super) fn curves(study: &Study, analysis: &Analysis) -> Markup {
                     @let heights = points().flat_map(|p| [p.y, p.range().0, p.range().1]);
                     @let y = if scale == Scale::Log { decades(heights) } else { Axis::around(heights, 4) };
                     figure {
-                        figcaption {
-                            (short(task))
-                            @if several { br; span { (shift_title(task.shift)) } }
-                        }
+                        (task_caption(analysis, task))
                         (svg::lines(&Frame {
                             label: &format!("{y_unit}, {task}"),
                             size: (320.0, 210.0),

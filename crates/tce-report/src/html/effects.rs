@@ -1,9 +1,10 @@
 //! One figure that tells where a method helps, does nothing, harms.
 
 use maud::{Markup, html};
+use tce_base::counted;
 use tce_data::{Quality, Shift};
 
-use super::{capital, counted, one, signed, term, title_cell};
+use super::{capital, one, signed, term, title_cell};
 use crate::analysis::{Analysis, Gap};
 use crate::difference::{Difference, ENOUGH, Effect, LEAST, SURE};
 use crate::stats::Estimate;

@@ -1,9 +1,10 @@
 //! The findings: every method beside the best baseline.
 
 use maud::{Markup, html};
+use tce_base::counted;
 use tce_data::Shift;
 
-use super::{capital, counted, estimate, one, said, signed, term, title_cell};
+use super::{capital, estimate, one, said, signed, term, title_cell};
 use crate::analysis::{Aggregate, Analysis, Comparison, Finding, gap_words, verdict_words};
 use crate::paper;
 use crate::study::Study;

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use maud::{Markup, html};
+use tce_base::counted;
 
 use crate::analysis::{Analysis, opening};
 use crate::study::{Study, shift_title};
@@ -19,7 +20,7 @@ mod statistics;
 pub(crate) mod words;
 
 use parts::{capital, classes, estimate, one, percent, range, said, signed, title_cell};
-pub(crate) use parts::{counted, decades, document, duration};
+pub(crate) use parts::{decades, document, duration};
 pub(crate) use words::term;
 
 /// The page's text.

@@ -1,10 +1,12 @@
 //! What several sections are made of: the page around them, numbers as text, colours of methods.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use tce_data::Task;
 
 use super::words;
 use crate::analysis::Analysis;
 use crate::stats::Estimate;
+use crate::study::{shift_title, short};
 use crate::svg::{Axis, Series, minus};
 
 /// A whole page around `body`, with the words that it links to explained at its end.
@@ -62,10 +64,6 @@ pub(crate) fn said(e: &Estimate, decimals: usize) -> String {
     format!("{} {}", minus(format!("{:.decimals$}", e.point)), range(e.interval, decimals)).trim_end().to_owned()
 }
 
-pub(crate) fn counted(n: usize, one: &str, many: &str) -> String {
-    if n == 1 { format!("1 {one}") } else { format!("{n} {many}") }
-}
-
 /// Colour and dashes of every method: baselines are grey.
 pub(crate) fn classes(analysis: &Analysis) -> Vec<Series> {
     let (mut baselines, mut others) = (0, 0);
@@ -83,6 +81,16 @@ pub(crate) fn title_cell(analysis: &Analysis, m: usize) -> Markup {
     html! {
         (analysis.methods[m].title)
         @if analysis.needs_mark(m) { " " span class="badge" { "published mode" } }
+    }
+}
+
+/// The caption of a task's figure; with the shift, where the report has several.
+pub(crate) fn task_caption(analysis: &Analysis, task: &Task) -> Markup {
+    html! {
+        figcaption {
+            (short(task))
+            @if analysis.tables.len() > 1 { br; span { (shift_title(task.shift)) } }
+        }
     }
 }
 

@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use maud::{Markup, html};
+use tce_base::counted;
 use tce_data::Task;
 
-use super::{counted, duration, one, term};
+use super::{duration, one, term};
 use crate::analysis::score;
 use crate::folder::Verdict;
 use crate::study::{Recipe, Run, Study, order};

@@ -3,8 +3,9 @@
 use std::collections::BTreeSet;
 
 use maud::{Markup, html};
+use tce_base::counted;
 
-use super::{counted, estimate, one, range, signed, term, title_cell};
+use super::{estimate, one, range, signed, term, title_cell};
 use crate::analysis::{Analysis, Cell, ShiftTable, Total};
 use crate::study::{agent_title, shift_title};
 

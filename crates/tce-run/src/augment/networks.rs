@@ -84,14 +84,13 @@ pub fn networks(
         };
         return Ok((generator, stage, trained));
     }
-    let started = std::time::Instant::now();
     let attempt = stage.attempt()?;
     let kept = Kept::new(&attempt);
     let work = Work { seeds, device, keeper: &kept };
     let source = if g.source_states { Some(inputs.source_rows()?) } else { None };
     let target = inputs.imitated(&config.target);
     let (generator, mut trained) = Generator::fit(source, &target, g, action_models.as_ref().map(|j| &j.0), &work)?;
-    trained.seconds = started.elapsed().as_secs_f64();
+    trained.seconds = attempt.seconds();
     generator.state.save(&attempt.file(files[0]))?;
     generator.transition.save(&attempt.file(files[1]))?;
     let cycles = trained.state_curve.iter().map(|end| cycle_file("state", end.step));

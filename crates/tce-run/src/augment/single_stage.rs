@@ -105,14 +105,13 @@ fn train(
     if let Some(trained) = stage.summary::<Trained>()? {
         return Ok((SingleStage { model: ScoreModel::load(&stage.file(file), device)?, trained }, stage));
     }
-    let started = std::time::Instant::now();
     let attempt = stage.attempt()?;
     let table = learned(inputs, scored.is_some())?;
     let kept = Kept::new(&attempt);
     let work = Work { seeds, device, keeper: &kept };
     let mut network = SingleStage::fit(table, scored.map(|s| s.source.as_slice()), config, &work)?;
     network.model.save(&attempt.file(file))?;
-    network.trained.seconds = started.elapsed().as_secs_f64();
+    network.trained.seconds = attempt.seconds();
     attempt.finish(&[file.to_owned()], &network.trained)?;
     Ok((network, stage))
 }

@@ -3,7 +3,7 @@
 use tce_augment::config::FilterKind;
 use tce_augment::score_training::held_out_rows;
 use tce_augment::units::Units;
-use tce_base::{Streams, begin_step};
+use tce_base::{Streams, begin_step, counted};
 use tce_data::{NeighbourOptions, Rows, Transitions, nn_distances, zscore_keep};
 use tce_diagnosis::bounds::calibration;
 use tce_diagnosis::{
@@ -178,7 +178,10 @@ impl Work<'_> {
         let compare = |h: &memorisation::HeldOut| h.compare(&pairs(self.units(), &kept), streams);
         let coverage = references.map_or(Ok(None), |r| r.covered_by(&kept, self.units(), streams))?;
         if references.is_some() && coverage.is_none() {
-            notes.push(format!("With y_max = {y} the filter leaves {} rows: too few for a coverage.", kept.len()));
+            notes.push(format!(
+                "With y_max = {y} the filter leaves {}: too few for a coverage.",
+                counted(kept.len(), "row", "rows")
+            ));
         }
         Ok(AtBound {
             y_max: decimal(y),

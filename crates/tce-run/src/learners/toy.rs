@@ -44,7 +44,6 @@ impl Method for ToyConfig {
             published: None,
             table: "toy",
             needs: OtherRows::Any,
-            successors: false,
             episodes: false,
             scores: RowScores::None,
         }

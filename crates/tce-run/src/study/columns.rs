@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tce_base::sha256_hex;
 use tce_data::Task;
-use tce_report::{Kin, Recipe, RunFolder, mixed};
+use tce_report::{Recipe, RunFolder, Work, mixed};
 
 /// A finished run of `tce run`.
 pub struct Finished {
@@ -24,11 +24,11 @@ pub fn columns(finished: &[Finished], notes: &mut Vec<String>) -> Vec<String> {
         |f| f.directory.display().to_string().rsplit('-').next().unwrap_or_default().to_owned(),
     ];
     for mark in marks {
-        let members = finished.iter().zip(&ids).flat_map(|(run, id)| {
-            let kin = |seed| Kin { settings: run.recipe.settings(&run.folder), inputs: &run.folder.inputs, seed };
-            run.folder.members.iter().map(move |member| (run.task, id.as_str(), kin(member.seed)))
+        let works = finished.iter().zip(&ids).flat_map(|(run, id)| {
+            let members = run.folder.members.iter();
+            members.map(move |member| Work::of(run.task, id, member.seed, &run.recipe, &run.folder))
         });
-        let mixed = mixed(members);
+        let mixed = mixed(works);
         for (Finished { name, folder, .. }, id) in finished.iter().zip(&mut ids).filter(|(_, id)| mixed.contains(*id)) {
             *id = format!("{id} {}", mark(folder));
             let note = format!(

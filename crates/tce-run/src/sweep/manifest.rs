@@ -229,10 +229,8 @@ impl Manifest {
                 return Err(Error::Failed(format!("{}: not all data can be had:\n{list}", path.display())));
             }
             let tasks = without.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-            tce_base::note!(
-                "{} tasks are left out, because their data cannot be had ({tasks}):\n{list}",
-                without.len()
-            );
+            let (are, their) = if without.len() == 1 { ("task is", "its") } else { ("tasks are", "their") };
+            tce_base::note!("{} {are} left out, because {their} data cannot be had ({tasks}):\n{list}", without.len());
         }
         Ok(plan.sorted())
     }

@@ -9,7 +9,9 @@
 //! | `runs/` | data, stages and runs, as `tce run --out` leaves them; pieces of work share stages |
 //! | `done/ID.json` | outcome of a piece of work, made by `link(2)`: the first one wins |
 //! | `faults/` | outcomes that came later and differ: faults of determinism |
-//! | `active/`, `failed/`, `logs/`, `slurm/` | running work, failures with reasons, output, submissions |
+//! | `active/` | who is at which work: a file with a heartbeat for each process; what one does, no other begins |
+//! | `spent/` | seconds that unfinished work took so far |
+//! | `failed/`, `logs/`, `slurm/` | failures with reasons, output, submissions |
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -22,6 +24,7 @@ use tce_base::{FileError, read_if_there, sha256_file, write_atomically};
 use crate::error::{Error, Result};
 use crate::inputs::DataArgs;
 
+mod claim;
 mod description;
 pub mod gather;
 pub mod local;

@@ -1,8 +1,8 @@
 //! A sweep on a Slurm cluster: array jobs of unfinished work.
 //!
 //! Job numbers are notes only, and `sacct` is not needed: a launch submits work that is neither finished nor, according to
-//! `squeue`, submitted. If the queue loses a job, or a node that was given up still runs, another launch does no harm: two copies of
-//! the same work are allowed (see [`super::work`]).
+//! `squeue`, submitted. If the queue loses a job, or a node that was given up still runs, another launch does no harm: what a process is
+//! doing, a second one waits for, and two copies of the same work are allowed (see [`super::work`]).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;

@@ -2,18 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::path::PathBuf;
+use std::time::UNIX_EPOCH;
 
 use serde::Serialize;
-use tce_base::Owner;
+use tce_base::counted;
 
-use super::work::{Active, now};
-use super::{Kind, Sweep};
+use super::claim::{Active, now};
+use super::{Entry, Kind, Sweep};
+use crate::clock;
 use crate::error::{Error, Result};
-
-/// A process without a heartbeat for so long counts as lost.
-const SILENCE: Duration = Duration::from_secs(60);
 
 /// The state of all work of a sweep.
 #[derive(Clone, Debug, Serialize)]
@@ -51,7 +49,7 @@ pub struct TierState {
     pub done: usize,
     /// All pieces of work.
     pub all: usize,
-    /// Seconds that the finished ones took.
+    /// Seconds that the finished ones took, over all attempts.
     pub seconds: f64,
     /// Seconds that the others take, one after the other; None as long as nothing of their kind is finished.
     pub seconds_left: Option<f64>,
@@ -73,7 +71,7 @@ pub struct Running {
     pub what: String,
     /// Machine and process.
     pub owner: String,
-    /// Seconds since it began.
+    /// Seconds since it began, with those of earlier attempts.
     pub seconds: u64,
 }
 
@@ -129,7 +127,7 @@ impl Sweep {
                     index: entry.index,
                     what: entry.to_string(),
                     owner: a.owner.clone(),
-                    seconds: now().saturating_sub(a.since),
+                    seconds: self.seconds_of(entry, a),
                 }));
             } else if let Some(failure) = self.failure(entry) {
                 status.failed.push((entry.index, failure.error));
@@ -151,22 +149,13 @@ impl Sweep {
         Ok(status)
     }
 
-    /// Running processes, by the work's id.
-    fn active(&self) -> BTreeMap<String, Vec<Active>> {
-        let mut out: BTreeMap<String, Vec<Active>> = BTreeMap::new();
-        for file in fs::read_dir(self.directory.join("active")).into_iter().flatten().flatten() {
-            let modified = file.metadata().and_then(|m| m.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
-            let silent = SystemTime::now().duration_since(modified).is_ok_and(|d| d > SILENCE);
-            let name = file.file_name().to_string_lossy().into_owned();
-            let active = fs::read(file.path()).ok().and_then(|b| serde_json::from_slice::<Active>(&b).ok());
-            let Some((id, owner)) = name.split_once('.') else { continue };
-            // Of a process of this machine it is known at once.
-            let lost = silent || Owner::of(Path::new(owner)).is_some_and(|owner| owner.dead());
-            if let (false, Some(active)) = (lost, active) {
-                out.entry(id.to_owned()).or_default().push(active);
-            }
-        }
-        out
+    /// Seconds that `entry`, which `active` is doing, took so far, with what earlier attempts took.
+    fn seconds_of(&self, entry: &Entry, active: &Active) -> u64 {
+        let own = now().saturating_sub(active.since);
+        let Some(noted) = clock::noted(&self.spent(entry)) else { return own };
+        let at = noted.at.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
+        // A note of an earlier attempt says nothing of the time since.
+        if at < active.since { own } else { noted.seconds as u64 + now().saturating_sub(at) }
     }
 }
 
@@ -189,8 +178,8 @@ impl Status {
         match self.failed.len() {
             0 => Ok(()),
             n => Err(Error::Failed(format!(
-                "{n} {} failed, with the message{} above; mend the cause and launch the sweep again (logs: {})",
-                if n == 1 { "piece of work" } else { "pieces of work" },
+                "{} failed, with the message{} above; mend the cause and launch the sweep again (logs: {})",
+                counted(n, "piece of work", "pieces of work"),
                 if n == 1 { "" } else { "s" },
                 self.logs.display()
             ))),

@@ -1,19 +1,19 @@
-//! One piece of work, done by one process or by several copies at once.
+//! One piece of work. One process at a time does it; where two do after all, the first outcome stays, and another one is a fault.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, Owner, PROGRAM, read_json, sha256_file, write_json, write_json_first};
+use tce_base::{FileError, Owner, PROGRAM, interrupted, read_json, sha256_file, write_json, write_json_first};
 use tce_nn::Device;
 use tce_report::analysis::counted;
 
+use super::claim::now;
 use super::{Entry, Kind, Sweep};
 use crate::augment::{augment_rows, label_models};
+use crate::clock::Clock;
 use crate::config::{Config, GeneratedRows};
 use crate::error::{Error, Result};
 use crate::inputs::{Inputs, source_file, target_file};
@@ -27,8 +27,8 @@ use crate::verdict::{Candidate, Verdict, recommend_or_only};
 
 /// What the folders of verdicts begin with.
 const VERDICT: &str = "verdict";
-/// Seconds between two heartbeats.
-const BEAT: Duration = Duration::from_secs(10);
+/// Time between two looks at work that another process does.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// The outcome of a piece of work.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -44,7 +44,7 @@ pub struct Outcome {
     pub place: PathBuf,
     /// SHA-256 of its files.
     pub files: BTreeMap<String, String>,
-    /// Seconds it took.
+    /// Seconds it took. Interrupted attempts count up to their last checkpoint.
     pub seconds: f64,
     /// Peak memory of the process, in bytes, where the system reports it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -75,20 +75,25 @@ pub struct Failure {
     pub at: u64,
 }
 
-/// A running process.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Active {
-    /// Machine and process.
-    pub owner: String,
-    /// The batch system's job.
-    pub job: Option<String>,
-    /// Seconds since 1970.
-    pub since: u64,
+/// What becomes of work that another process is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Taken {
+    /// This process waits until it is done, or does it if the other process is lost.
+    Wait,
+    /// This process leaves it alone.
+    Leave,
 }
 
-/// Seconds since 1970.
-pub fn now() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
+/// Waits for a moment.
+fn pause() -> Result<()> {
+    let started = Instant::now();
+    while started.elapsed() < LOOK {
+        if interrupted() {
+            return Err(Error::interrupted());
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Ok(())
 }
 
 /// Resets the peak memory of this process, so that each piece of work in it has its own. Where the system cannot do that, a
@@ -102,46 +107,6 @@ fn peak_memory() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let kilobytes = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.split_whitespace().next()?;
     Some(kilobytes.parse::<u64>().ok()? * 1024)
-}
-
-/// A heartbeat: a file in `active/` that is touched until this is dropped.
-struct Heartbeat {
-    path: PathBuf,
-    stop: Arc<AtomicBool>,
-    thread: Option<std::thread::JoinHandle<()>>,
-}
-
-impl Heartbeat {
-    fn start(path: PathBuf) -> Result<Self> {
-        let job = std::env::var("SLURM_JOB_ID").ok();
-        write_json(&path, &Active { owner: Owner::this().to_string(), job, since: now() })?;
-        let stop = Arc::new(AtomicBool::new(false));
-        let (flag, file) = (stop.clone(), path.clone());
-        let thread = std::thread::spawn(move || {
-            let mut last = Instant::now();
-            while !flag.load(Ordering::Relaxed) {
-                std::thread::park_timeout(BEAT);
-                if last.elapsed() >= BEAT {
-                    last = Instant::now();
-                    // A full disk must not end the work; the sign of life comes back with the space.
-                    let _ =
-                        fs::File::options().append(true).open(&file).and_then(|f| f.set_modified(SystemTime::now()));
-                }
-            }
-        });
-        Ok(Self { path, stop, thread: Some(thread) })
-    }
-}
-
-impl Drop for Heartbeat {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            thread.thread().unpark();
-            let _ = thread.join();
-        }
-        let _ = fs::remove_file(&self.path);
-    }
 }
 
 /// A data set as an outcome: no score, its folder, its hash.
@@ -175,26 +140,51 @@ impl Sweep {
         Ok(missing)
     }
 
-    /// Does a piece of work, unless it is done.
+    /// Does a piece of work, unless it is done; None if another process is doing it, and `taken` says to leave it.
     ///
     /// # Errors
-    /// The failure, which is also stored in `failed/`; or if an earlier copy of the work has another result.
-    pub fn work(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
+    /// The failure, which is also stored in `failed/`; if an earlier copy of the work has another result; or if the user interrupts.
+    pub fn work(&self, entry: &Entry, taken: Taken, device: &Device) -> Result<Option<Outcome>> {
         if let Some(outcome) = self.outcome(entry)? {
-            return Ok(outcome);
+            return Ok(Some(outcome));
         }
-        let beat = Heartbeat::start(self.file("active", &format!("{}.{}.json", entry.id, Owner::this())))?;
+        let mut told = false;
+        let claim = loop {
+            let claim = self.claim(entry)?;
+            // Behind the claim: whoever had the work may just have come to its end.
+            if let Some(outcome) = self.outcome(entry)? {
+                return Ok(Some(outcome));
+            }
+            if let Some(claim) = claim {
+                break claim;
+            }
+            if taken == Taken::Leave {
+                return Ok(None);
+            }
+            if let Some(owner) = self.other_at(entry).filter(|_| !told) {
+                told = true;
+                tce_base::note!("{entry}: {owner} is doing it; waiting for its end");
+            }
+            pause()?;
+        };
         self.forget_failure(entry);
+        let clock = Clock::start(self.spent(entry));
         let outcome = match self.changed_input(entry) {
             Some(change) => Err(Error::Failed(change)),
-            None => self.compute(entry, device).and_then(|outcome| self.settle(outcome)),
+            None => self.compute(entry, &clock, device).and_then(|outcome| self.settle(outcome)),
         };
-        drop(beat);
         match &outcome {
+            Ok(_) => clock.forget(),
             Err(e) if e.exit_code() != 130 => self.note_failure(entry, &e.to_string())?,
-            _ => {}
+            Err(_) => {}
         }
-        outcome
+        drop(claim);
+        outcome.map(Some)
+    }
+
+    /// Where the seconds are noted that an unfinished piece of work took so far.
+    pub(super) fn spent(&self, entry: &Entry) -> PathBuf {
+        self.file("spent", &format!("{}.json", entry.id))
     }
 
     fn failure_file(&self, entry: &Entry) -> PathBuf {
@@ -217,10 +207,9 @@ impl Sweep {
         serde_json::from_slice(&bytes).ok()
     }
 
-    fn compute(&self, entry: &Entry, device: &Device) -> Result<Outcome> {
+    fn compute(&self, entry: &Entry, clock: &Clock, device: &Device) -> Result<Outcome> {
         // Before hours of training, not after them.
         tce_sim::open_library()?;
-        let started = Instant::now();
         forget_peak_memory();
         let config = self.manifest.config(entry)?;
         let args = self.data(entry);
@@ -259,7 +248,7 @@ impl Sweep {
             diverged,
             place: place.strip_prefix(&self.directory).unwrap_or(&place).to_owned(),
             files,
-            seconds: started.elapsed().as_secs_f64(),
+            seconds: clock.seconds(),
             memory: peak_memory(),
             program: PROGRAM.into(),
         })

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
-use tce_base::{set_quiet, write_json};
+use tce_base::{counted, set_quiet, write_json};
 use tce_nn::Device;
 use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
@@ -135,10 +135,7 @@ fn render(report: &Report) -> String {
         "{}, {}, {}, {:.1} GFLOP/s a core in 256 x 256 products\n{}\n",
         report.processor,
         report.instructions,
-        match report.threads {
-            1 => "1 thread".to_owned(),
-            n => format!("{n} threads"),
-        },
+        counted(report.threads, "thread", "threads"),
         report.core_gflops,
         table(&header, rows)
     );

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::counted;
 use tce_data::{Agent, Inspection, Quality, ScoreTable, Shift, parse_environment, reference_scores, save_d4rl};
 use tce_run::error::{Error, Result};
 use tce_run::inputs::{Actors, d4rl_recipe};
@@ -90,10 +91,10 @@ impl Collect {
         let content = tce_data::inspect(&data, Some(EPISODE_LIMIT));
         if content.complete_episodes == 0 {
             tce_base::note!(
-                "no episode came to its end: {} rows on {} lanes are {} steps each; for whole episodes take more rows or fewer --lanes",
-                self.rows,
-                self.lanes,
-                self.rows / self.lanes
+                "no episode came to its end: {} on {} are {} each; for whole episodes take more rows or fewer --lanes",
+                counted(self.rows, "row", "rows"),
+                counted(self.lanes, "lane", "lanes"),
+                counted(self.rows / self.lanes, "step", "steps")
             );
         }
         let reference = reference_scores(agent, shift, ScoreTable::default());

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
+use tce_base::counted;
 use tce_data::{
     Agent, Check, EpisodeEnds, Finding, Inspection, LoadReport, Loaded, ScoreTable, Severity, Transitions,
     infer_agents, reference_scores,
@@ -217,11 +218,13 @@ impl Uses {
             terminals: match (agent, terminals, known) {
                 (Some(agent), ..) => format!("{agent}'s rule"),
                 (None, 0, _) => "none: no row of this file is terminal".into(),
+                (None, 1, 0) => "none: one row is terminal, and it has no next state".into(),
                 (None, n, 0) => format!("none: {n} rows are terminal, and none of them has a next state"),
                 (None, n, known) if known < n => {
-                    format!("learned from {known} of the {n} terminal rows, which have a next state")
+                    let have = if known == 1 { "has" } else { "have" };
+                    format!("learned from {known} of the {n} terminal rows, which {have} a next state")
                 }
-                (None, n, _) => format!("learned from the {n} terminal rows"),
+                (None, n, _) => format!("learned from the {}", counted(n, "terminal row", "terminal rows")),
             },
         }
     }
@@ -239,7 +242,7 @@ impl CheckArgs {
             let range = range_of(given, transitions.act_dim, file).map_err(Error::Usage)?;
             let message = match range.outside(&transitions.actions) {
                 0 => format!("taken as {range} (--action-range)"),
-                n => format!("taken as {range} (--action-range); {n} values lie outside"),
+                n => format!("taken as {range} (--action-range); {} outside", counted(n, "value lies", "values lie")),
             };
             check.findings.push(Finding { severity: Severity::Note, field: "actions", message });
         }
@@ -274,7 +277,10 @@ impl CheckArgs {
         }
         match all.iter().filter(|c| !c.passes).count() {
             0 => Ok(()),
-            n => Err(Error::Failed(format!("{n} of {} data sets do not pass", all.len()))),
+            n => {
+                let (sets, verb) = (counted(all.len(), "data set", "data sets"), if n == 1 { "does" } else { "do" });
+                Err(Error::Failed(format!("{n} of {sets} {verb} not pass")))
+            }
         }
     }
 }
@@ -285,7 +291,8 @@ fn render_check(c: &Checked) -> String {
     let mut text = format!("{}\n", c.load);
     let mut line = |name: &str, value: String| text += &format!("  {name:<11} {value}\n");
     let robot = c.environment.clone().unwrap_or_else(|| "an own one".into());
-    line("robot", format!("{robot}, {} observations, {} actions", content.obs_dim, content.act_dim));
+    let observations = counted(content.obs_dim, "observation", "observations");
+    line("robot", format!("{robot}, {observations}, {}", counted(content.act_dim, "action", "actions")));
     let lengths = &content.lengths;
     let order = if c.load.environments > 1 {
         format!(", of {} environments in turn", c.load.environments)
@@ -293,6 +300,7 @@ fn render_check(c: &Checked) -> String {
         String::new()
     };
     let length = match lengths.min == lengths.max {
+        true if lengths.max == 1.0 => "one step each".to_owned(),
         true => format!("{:.0} steps each", lengths.min),
         false => format!("{:.0} to {:.0} steps, {:.0} on average", lengths.min, lengths.max, lengths.mean),
     };
@@ -300,8 +308,11 @@ fn render_check(c: &Checked) -> String {
         "episodes",
         format!("{}, {length}; {} whole{order}; {}", content.episodes, content.complete_episodes, c.load.episodes),
     );
-    let ends = (content.terminals, content.timeouts);
-    line("ends", format!("{} terminals, {} time-outs or cuts", ends.0, ends.1));
+    let ends = (
+        counted(content.terminals, "terminal", "terminals"),
+        counted(content.timeouts, "time-out or cut", "time-outs or cuts"),
+    );
+    line("ends", format!("{}, {}", ends.0, ends.1));
     let range = |name: &str, d: &tce_data::DimensionSummary| {
         let (low, high) = (
             d.min.iter().copied().fold(f32::INFINITY, f32::min),
@@ -317,16 +328,22 @@ fn render_check(c: &Checked) -> String {
     line(
         "returns",
         format!(
-            "{:.1} ± {:.1}, {:.1} to {:.1}, of {} episodes",
-            returns.mean, returns.std, returns.min, returns.max, returns.count
+            "{:.1} ± {:.1}, {:.1} to {:.1}, of {}",
+            returns.mean,
+            returns.std,
+            returns.min,
+            returns.max,
+            counted(returns.count, "episode", "episodes")
         ),
     );
     line("duplicates", format!("{:.1} % of the rows", 100.0 * c.check.duplicate_share));
     line(
         "used for",
         format!(
-            "{} rows: learning; {}: networks and models of s'; {}: what follows episodes",
-            uses.learning, uses.dynamics, uses.episodes
+            "{}: learning; {}: networks and models of s'; {}: what follows episodes",
+            counted(uses.learning, "row", "rows"),
+            uses.dynamics,
+            uses.episodes
         ),
     );
     line("terminals", uses.terminals.clone());

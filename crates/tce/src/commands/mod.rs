@@ -4,6 +4,7 @@ use std::ffi::OsString;
 use std::sync::{Mutex, PoisonError};
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use tce_base::counted;
 use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
 
@@ -145,7 +146,7 @@ impl Cli {
                 return Err(Error::Usage("--threads 0: expected at least 1".into()));
             }
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
-            pool.map_err(|e| Error::Failed(format!("cannot start {threads} threads: {e}")))?;
+            pool.map_err(|e| Error::Failed(format!("cannot start {}: {e}", counted(threads, "thread", "threads"))))?;
         }
         if self.save_every.is_nan() || self.save_every < 0.0 {
             return Err(Error::Usage(format!("--save-every {}: expected a number of seconds", self.save_every)));

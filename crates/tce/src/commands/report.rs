@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::counted;
 use tce_report::analysis::{Aggregate, Comparison, opening};
 use tce_report::{Analysis, Options, analyse};
 use tce_run::error::{Error, Result};
@@ -94,7 +95,7 @@ fn comparison(analysis: &Analysis, c: &Comparison) -> String {
     });
     let interval = format!("{:.0} % interval", 100.0 * c.level);
     let header = ["method", "seeds", "mean", "IQM", &interval, "kind"];
-    let tasks = if c.tasks.len() == 1 { "1 task".to_owned() } else { format!("{} tasks", c.tasks.len()) };
+    let tasks = counted(c.tasks.len(), "task", "tasks");
     let scores = table(&header, scores);
     let mut text = format!(
         "{}\n{scores}\n",

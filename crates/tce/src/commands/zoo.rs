@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use tce_base::{Streams, interrupted, mean_std, write_atomically};
+use tce_base::{Streams, counted, interrupted, mean_std, write_atomically};
 use tce_data::{Agent, ScoreTable, Shift, parse_environment};
 use tce_learn::Policy;
 use tce_nn::NamedParameters;
@@ -150,10 +150,11 @@ fn list(all: &[Shown]) -> String {
 fn show(s: &Shown) -> String {
     let c = &s.card;
     let began = c.from.clone().unwrap_or_else(|| "new networks".into());
+    let episodes = counted(c.episodes, "episode", "episodes");
     let rows = [
         ("robot", format!("{}, {}", c.agent, c.shift)),
         ("role", c.role.clone().unwrap_or_default()),
-        ("return", format!("{:.1} ± {:.1} over {} episodes with sampled actions", c.mean, c.std, c.episodes)),
+        ("return", format!("{:.1} ± {:.1} over {episodes} with sampled actions", c.mean, c.std)),
         ("length", format!("{:.1}", c.length)),
         ("score", s.score()),
         ("training", training(c)),

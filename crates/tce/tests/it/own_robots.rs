@@ -166,7 +166,7 @@ fn wild_actions_are_told() {
     assert!(text.contains("action columns [0] have values more than ten times"), "{text}");
     assert_eq!(rows.actions[..240], target.actions);
     let (_, text) = augment(dir.path(), &["--action-range", "-1:1"]);
-    assert!(text.contains("1 action values lie outside of --action-range"), "{text}");
+    assert!(text.contains("1 action value lies outside of --action-range"), "{text}");
     target.actions.iter_mut().for_each(|a| *a *= 3e38);
     target.actions[14] = -3e38;
     target.actions[0] = 3e38;

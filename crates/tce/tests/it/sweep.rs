@@ -5,10 +5,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
 use crate::common::sweeps::{SETS, describe, outcomes};
-use crate::common::{message, program, silent, tce, tce_json};
+use crate::common::{files, message, program, silent, tce, tce_json};
 use rand::RngExt;
 use tce_base::Streams;
 
@@ -120,7 +120,7 @@ fn in_group(directory: &Path, args: &[&str]) -> Child {
 fn every_example_is_a_plan() {
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
     let dir = tempfile::tempdir().unwrap();
-    let plans = crate::common::files(&examples).into_iter().filter(|p| p.extension().is_some_and(|e| e == "toml"));
+    let plans = files(&examples).into_iter().filter(|p| p.extension().is_some_and(|e| e == "toml"));
     let mut seen = 0;
     for plan in plans {
         let planned = tce_json(dir.path(), &["sweep", "plan", plan.to_str().unwrap(), "--dry-run"]);
@@ -160,6 +160,143 @@ fn a_sweep_survives_its_launcher_and_its_workers() {
     // Copies that still run come to their end without harm.
     std::thread::sleep(Duration::from_millis(500));
     assert_eq!(outcomes(&dir.path().join("killed")), expected);
+}
+
+/// A piece of work by its kind and method: its place in the list, and its id.
+fn piece(sweep: &Path, kind: &str, variant: Option<&str>) -> (usize, String) {
+    let manifest = fs::read_to_string(sweep.join("manifest.jsonl")).unwrap();
+    let mut entries = manifest.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+    let entry = entries.find(|e| e["kind"] == kind && e["variant"].as_str() == variant).expect("it is planned");
+    (entry["index"].as_u64().unwrap() as usize, entry["id"].as_str().unwrap().to_owned())
+}
+
+/// Waits until something holds, with something to do between two looks.
+fn wait_for(what: &str, ready: impl Fn() -> bool, between: impl Fn()) {
+    let until = Instant::now() + Duration::from_secs(300);
+    while !ready() {
+        assert!(Instant::now() < until, "no {what} within five minutes");
+        between();
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+fn touch(path: &Path, at: SystemTime) {
+    fs::File::options().append(true).open(path).unwrap().set_modified(at).unwrap();
+}
+
+#[test]
+fn work_of_another_launch_is_left_to_it_and_done_once_that_is_lost() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = describe(dir.path(), "s", 1);
+    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let sweep = dir.path().join("s");
+    let ((index, source), (_, rows)) = (piece(&sweep, "source", None), piece(&sweep, "expand", None));
+    let (_, clones) = piece(&sweep, "run", Some("bc"));
+    // A process of another machine that shares the folder collects the source rows.
+    let other = sweep.join(format!("active/{source}.elsewhere-1-2.7.1.json"));
+    fs::create_dir_all(other.parent().unwrap()).unwrap();
+    fs::write(&other, r#"{"owner":"elsewhere-1-2.7.1","job":null,"since":1}"#).unwrap();
+    let heartbeat = || touch(&other, SystemTime::now());
+    let mut launcher = in_group(dir.path(), &["sweep", "launch", "s", "--workers", "2"]);
+    // What does not need them is done meanwhile.
+    wait_for("clone", || sweep.join(format!("done/{clones}.json")).exists(), heartbeat);
+    heartbeat();
+    std::thread::sleep(Duration::from_millis(2500));
+    assert!(launcher.try_wait().unwrap().is_none(), "it waits for the other process");
+    for id in [&source, &rows] {
+        assert!(
+            !sweep.join(format!("logs/{id}.log")).exists(),
+            "{id} was begun a second time, or without what it needs"
+        );
+    }
+    let left = tce(dir.path(), &["sweep", "run-one", "s", &index.to_string(), "--leave-running"]);
+    assert!(left.status.success() && message(&left).contains("another process is doing it"), "{}", message(&left));
+    // Nothing was heard of it for two minutes.
+    touch(&other, SystemTime::now() - Duration::from_secs(120));
+    let ended = launcher.wait_with_output().unwrap();
+    assert!(ended.status.success(), "{}", message(&ended));
+    assert!(message(&ended).contains("other launches are busy with that"), "{}", message(&ended));
+    assert_eq!(outcomes(&sweep).len(), 2 + 1 + 3);
+}
+
+#[test]
+fn two_launches_share_the_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = describe(dir.path(), "s", 2);
+    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let launch = ["sweep", "launch", "s", "--workers", "1"];
+    for launcher in [(); 2].map(|()| in_group(dir.path(), &launch)) {
+        let ended = launcher.wait_with_output().unwrap();
+        assert!(ended.status.success(), "{}", message(&ended));
+    }
+    let sweep = dir.path().join("s");
+    let gathered = tce_json(dir.path(), &["sweep", "gather", "s"]);
+    assert_eq!(gathered["rows"].as_array().unwrap().len(), 6);
+    let mut runs = 0;
+    for (name, outcome) in outcomes(&sweep) {
+        let place = outcome["place"].as_str().unwrap();
+        if !sweep.join(place).join("result.json").exists() {
+            continue;
+        }
+        // Whoever begins a run says where.
+        let log = fs::read_to_string(sweep.join("logs").join(name.replace(".json", ".log"))).unwrap();
+        assert_eq!(log.matches(place).count(), 1, "{name} was begun more than once:\n{log}");
+        runs += 1;
+    }
+    assert_eq!(runs, 6);
+    assert!(files(&sweep.join("active")).is_empty());
+}
+
+#[test]
+fn work_that_was_killed_counts_the_time_of_all_attempts() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = describe(dir.path(), "s", 1);
+    let text = fs::read_to_string(dir.path().join(&file)).unwrap();
+    fs::write(dir.path().join(&file), text.replace("learner.steps=120", "learner.steps=600")).unwrap();
+    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let sweep = dir.path().join("s");
+    let (index, id) = piece(&sweep, "run", Some("bc"));
+    let index = index.to_string();
+    let mut first = in_group(dir.path(), &["sweep", "run-one", "s", &index]);
+    let is_checkpoint = |path: &Path| {
+        let name = path.file_name().unwrap().to_string_lossy();
+        name.starts_with("learner.") && name.ends_with(".checkpoint")
+    };
+    wait_for("checkpoint", || files(&sweep.join("runs")).iter().any(|p| is_checkpoint(p)), || {});
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // As if it had begun long before.
+    let is_note =
+        |path: &Path| path.extension().is_some_and(|e| e == "seconds") || path.parent().unwrap().ends_with("spent");
+    let notes: Vec<_> = files(&sweep).into_iter().filter(|p| is_note(p)).collect();
+    assert_eq!(notes.len(), 3, "of the piece of work, the run and its training: {notes:?}");
+    for note in &notes {
+        let at = fs::metadata(note).unwrap().modified().unwrap();
+        fs::write(note, r#"{"seconds":5000}"#).unwrap();
+        touch(note, at);
+    }
+    let again = tce(dir.path(), &["sweep", "run-one", "s", &index]);
+    assert!(again.status.success(), "{}", message(&again));
+    let read = |path: &Path| serde_json::from_slice::<serde_json::Value>(&fs::read(path).unwrap()).unwrap();
+    let outcome = read(&sweep.join(format!("done/{id}.json")));
+    let done = read(&sweep.join(outcome["place"].as_str().unwrap()).join("done.json"));
+    for seconds in [&outcome["seconds"], &done["summary"]["seconds"], &done["summary"]["learned"]["seconds"]] {
+        let seconds = seconds.as_f64().unwrap();
+        assert!((5000.0..6000.0).contains(&seconds), "{seconds} s in {outcome} and {done}");
+    }
+    assert!(files(&sweep.join("spent")).is_empty(), "nobody will resume it");
+}
+
+#[test]
+fn one_task_that_is_left_out_is_no_plural() {
+    let dir = tempfile::tempdir().unwrap();
+    // The zoo has no expert of ant-gravity-5.
+    let tasks = "tasks = [\"hopper-morph:medium->expert\", \"ant-gravity-5:medium->expert\"]\nvariants = [\"bc\"]\n";
+    fs::write(dir.path().join("s.toml"), format!("{tasks}from_zoo = true\nunavailable = \"skip\"\n")).unwrap();
+    let planned = tce(dir.path(), &["sweep", "plan", "s.toml", "--dry-run"]);
+    assert!(planned.status.success(), "{}", message(&planned));
+    let told = message(&planned);
+    assert!(told.contains("1 task is left out, because its data cannot be had (ant-gravity-5"), "{told}");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use tce_base::counted;
 use tce_data::{ActionRange, LoadOptions, LoadReport, Loaded, Transitions, read_attributes};
 use tce_run::error::{Error, Result};
 use tce_run::own::{DataFormat, Own, Writing, range_of};
@@ -73,14 +74,15 @@ fn lost_in_minari(
     }
     if report.unknown_successors > 0 {
         lost.push(format!(
-            "the last observation of {} episodes is not known and repeats the one before; Minari has no mark for that",
-            report.unknown_successors
+            "the last observation of {} is not known and repeats the one before; Minari has no mark for that",
+            counted(report.unknown_successors, "episode", "episodes")
         ));
     }
     let outside = range.outside(&rows.actions);
     if outside > 0 {
         lost.push(format!(
-            "{outside} action values lie outside of {range}, which is written as the range of the actions; --action-range sets another"
+            "{} outside of {range}, which is written as the range of the actions; --action-range sets another",
+            counted(outside, "action value lies", "action values lie")
         ));
     }
     lost

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use serde::Serialize;
-use tce_base::Streams;
+use tce_base::{Streams, counted};
 use tce_data::{Standardizer, Task};
 use tce_diffusion::metrics::sliced_wasserstein;
 use tce_diffusion::{Edm, Process, Sampler, Ve, Vp};
@@ -228,7 +228,7 @@ fn render_cycles(r: &CyclesReport) -> String {
         "{}: q_tran of {}, trained on {} rows, {} held out; the target's actions spread by {spread:.3}, its data score {behaviour}\n\
          consistency of real rows with inferred actions: {:.3} (p90 {:.3})\n{}\n\
          Action RMSE: Inv(s, ŝ') with ŝ' of q_tran against the behaviour's own action, one draw and the mean of 8, at rows that q_tran saw \
-         and rows that it did not.\nScore: the policy s -> Inv(s, ŝ') over {} episodes. Networks are done when action RMSE and score no longer \
+         and rows that it did not.\nScore: the policy s -> Inv(s, ŝ') over {}. Networks are done when action RMSE and score no longer \
          get better.",
         r.task,
         c.stage,
@@ -237,7 +237,7 @@ fn render_cycles(r: &CyclesReport) -> String {
         c.real.median,
         c.real.p90,
         table(&AtCycle::HEADER, c.networks.iter().map(AtCycle::cells)),
-        r.episodes
+        counted(r.episodes, "episode", "episodes")
     )
 }
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use serde::Serialize;
+use tce_base::counted;
 use tce_data::{ScoreTable, Shift};
 use tce_run::error::{Error, Result};
 use tce_sim::video::{Video, VideoOptions};
@@ -112,8 +113,9 @@ impl VideoArgs {
         let frames = video.frames();
         let longest = video.longest();
         let mut note = format!(
-            "{}: {frames} frames of {width}x{height}, {:.1} s, {:.1} MB",
+            "{}: {} of {width}x{height}, {:.1} s, {:.1} MB",
             file.display(),
+            counted(frames, "frame", "frames"),
             frames as f64 * video.interval(),
             bytes as f64 / 1e6
         );

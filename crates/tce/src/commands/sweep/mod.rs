@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
-use tce_base::interrupted;
+use tce_base::{counted, interrupted};
 use tce_nn::Device;
 use tce_run::device_kind::DeviceKind;
 use tce_run::error::{Error, Result};
 use tce_run::sweep::local::Share;
 use tce_run::sweep::slurm::{Array, Submission};
+use tce_run::sweep::work::Taken;
 use tce_run::sweep::{Check, Kind, Manifest, Sweep};
 
 use crate::output::{Output, fit, table};
@@ -25,7 +26,7 @@ mod render;
 pub enum SweepCommand {
     /// Turn a description (tasks × variants × overrides × seeds) into a list of work that does not change any more.
     Plan(Plan),
-    /// Do what is missing, on this machine or on Slurm. To be called again after any accident.
+    /// Do what is missing, on this machine or on Slurm. To be called again after any accident, and on several machines at once.
     Launch(Launch),
     /// Do pieces of work by their number in the manifest.
     RunOne(RunOne),
@@ -104,6 +105,9 @@ pub struct RunOne {
     /// Numbers of pieces of work.
     #[arg(required = true)]
     indices: Vec<usize>,
+    /// Leave work alone that another process is doing, and do not wait for it.
+    #[arg(long)]
+    leave_running: bool,
 }
 
 /// Arguments of `sweep status`.
@@ -285,7 +289,8 @@ impl Launch {
                     0 => Ok(()),
                     n => {
                         status.healthy()?;
-                        Err(Error::Failed(format!("{n} of the sweep's pieces of work are not done; launch it again")))
+                        let are = if n == 1 { "is" } else { "are" };
+                        Err(Error::Failed(format!("{n} of the sweep's pieces of work {are} not done; launch it again")))
                     }
                 }
             }
@@ -298,20 +303,30 @@ impl RunOne {
         let sweep = Sweep::open(&self.directory)?;
         let count = sweep.entries().len();
         if let Some(index) = self.indices.iter().find(|i| **i >= count) {
-            return Err(Error::Usage(format!("{index}: the manifest has {count} pieces of work, numbered from 0")));
+            let pieces = counted(count, "piece of work", "pieces of work");
+            return Err(Error::Usage(format!("{index}: the manifest has {pieces}, numbered from 0")));
         }
         let mut outcomes = Vec::new();
         let mut failed = None;
-        for &index in &self.indices {
-            match sweep.work(&sweep.entries()[index], device) {
-                Ok(outcome) => outcomes.push(outcome),
-                // The work's own checkpoint is written; the rest of the list comes in the next turn.
-                Err(e) if e.exit_code() == 130 => return Err(e),
-                Err(e) => {
-                    tce_base::note!("{}: {e}", sweep.entries()[index]);
-                    failed = Some(e);
+        let mut todo = self.indices;
+        // What others are doing is waited for behind everything else.
+        let turns: &[Taken] = if self.leave_running { &[Taken::Leave] } else { &[Taken::Leave, Taken::Wait] };
+        for &taken in turns {
+            for index in std::mem::take(&mut todo) {
+                match sweep.work(&sweep.entries()[index], taken, device) {
+                    Ok(Some(outcome)) => outcomes.push(outcome),
+                    Ok(None) => todo.push(index),
+                    // The work's own checkpoint is written; the rest of the list comes in the next turn.
+                    Err(e) if e.exit_code() == 130 => return Err(e),
+                    Err(e) => {
+                        tce_base::note!("{}: {e}", sweep.entries()[index]);
+                        failed = Some(e);
+                    }
                 }
             }
+        }
+        for index in todo {
+            tce_base::note!("{}: another process is doing it", sweep.entries()[index]);
         }
         match failed {
             Some(e) => Err(e),
@@ -398,9 +413,13 @@ impl Export {
             missing: study.missing.len(),
         };
         output.print(&exported, |e| {
-            let missing = if e.missing == 0 { String::new() } else { format!(", {} more have no result", e.missing) };
+            let missing = match e.missing {
+                0 => String::new(),
+                n => format!(", {} no result", counted(n, "more has", "more have")),
+            };
             let (file, kib) = (e.file.display(), e.bytes.div_ceil(1024));
-            format!("{file}: {} runs of {} tasks, {kib} KiB{missing}\nread it with: tce report {file}", e.runs, e.tasks)
+            let (runs, tasks) = (counted(e.runs, "run", "runs"), counted(e.tasks, "task", "tasks"));
+            format!("{file}: {runs} of {tasks}, {kib} KiB{missing}\nread it with: tce report {file}")
         });
         Ok(())
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use tce_base::plus_minus;
+use tce_base::{counted, plus_minus};
 use tce_report::analysis::DIVERGED;
 use tce_run::sweep::Kind;
 use tce_run::sweep::gather::Gathered;
@@ -41,11 +41,11 @@ pub fn status(status: &Status) -> String {
         (false, None) => "time left not known".to_owned(),
     };
     text += &format!(
-        "{} at work, {} waiting, {} failed, {} faults of determinism; {left}\n",
+        "{} at work, {} waiting, {} failed, {} of determinism; {left}\n",
         status.running.len(),
         status.waiting.len(),
         status.failed.len(),
-        status.faults
+        counted(status.faults, "fault", "faults")
     );
     for r in &status.running {
         text += &format!("  {} (for {} s, {})\n", r.what, r.seconds, r.owner);
@@ -89,15 +89,15 @@ pub fn gathered(gathered: &Gathered) -> String {
     }
     let diverged = gathered.rows.iter().filter(|row| row.diverged).count();
     if diverged > 0 {
-        text += &format!(
-            "\n{diverged} policies could not act to the end of their evaluation: each counts as {DIVERGED} points."
-        );
+        let policies = counted(diverged, "policy", "policies");
+        let (their, counts) = if diverged == 1 { ("its", "it counts") } else { ("their", "each counts") };
+        text += &format!("\n{policies} could not act to the end of {their} evaluation: {counts} as {DIVERGED} points.");
     }
     let problems = gathered.missing.len() + gathered.corrupt.len() + gathered.conflicts.len();
     if problems > 0 {
         text += &format!(
-            "\nPARTIAL: {} runs not done, {} corrupt, {} in conflict",
-            gathered.missing.len(),
+            "\nPARTIAL: {} not done, {} corrupt, {} in conflict",
+            counted(gathered.missing.len(), "run", "runs"),
             gathered.corrupt.len(),
             gathered.conflicts.len()
         );
