@@ -149,7 +149,7 @@ fn kills(usual: usize) -> usize {
 #[test]
 fn a_run_killed_anywhere_ends_with_the_bytes_of_an_undisturbed_one() {
     let dir = tempfile::tempdir().unwrap();
-    let ends = kill_loop(dir.path(), &pipeline("runs"), "runs", kills(40), 1);
+    let ends = kill_loop(dir.path(), &pipeline("runs"), "runs", kills(25), 1);
     eprintln!("{ends} runs came to their end");
 }
 
