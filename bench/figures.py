@@ -23,7 +23,7 @@ SHIFTS = ["morph", "kinematic", "gravity"]
 BLUE, ORANGE, GREEN, GREY, PALE = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c", "#dfe2e7"
 OURS = [("bc-ensemble", "five clones of the target rows, ours", BLUE), ("tce-og", "TCE(OG), ours", ORANGE)]
 # How a method is called in records from before it was the default.
-SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied)": "tce-og"}
+SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied, …)": "tce-og"}
 THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", PALE)]
 
 

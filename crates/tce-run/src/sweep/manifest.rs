@@ -132,6 +132,14 @@ struct Verdicts {
 }
 
 impl Verdicts {
+    /// A run of a task and a seed. Several tiers may share it; it is one policy.
+    fn add(&mut self, of: (Task, u64), run: usize) {
+        let policies = self.policies.entry(of).or_default();
+        if !policies.contains(&run) {
+            policies.push(run);
+        }
+    }
+
     /// Tasks and seeds that have a baseline and a method now, and had not before: what `tce run` chooses among.
     fn ready(&mut self, entries: &[Entry]) -> Vec<(Task, u64, Vec<usize>)> {
         let baseline = |run: &usize| entries[*run].variant.is_some_and(|v| Variant::BASELINES.contains(&v));
@@ -213,7 +221,7 @@ impl Manifest {
             for (task, variant, label, config) in own.iter().filter(|r| !without.contains(&r.0)) {
                 for seed in part.seeds.clone() {
                     let run = plan.add_run(&mut known, &part.name, (*task, *variant, label), config, seed);
-                    verdicts.policies.entry((*task, seed)).or_default().push(run);
+                    verdicts.add((*task, seed), run);
                 }
             }
             if description.verdicts {

@@ -172,11 +172,13 @@ fn tiers_come_one_after_the_other_and_share_their_work() {
 #[test]
 fn verdicts_choose_among_baselines_and_methods() {
     let text = "tasks = [\"hopper-morph:medium->expert\"]\nverdicts = true\n[[tiers]]\nname = \"a\"\nvariants = [\"tce-og\"]\nbaselines = false\n\
+                [[tiers]]\nname = \"a, once more\"\nvariants = [\"tce-og\"]\nbaselines = false\n\
                 [[tiers]]\nname = \"b\"\nvariants = [\"bc\"]\nbaselines = false\nseeds = 2\n\
                 [[tiers]]\nname = \"c\"\nvariants = [\"otdf\"]\nbaselines = false\n";
     let manifest = plan(text).unwrap();
     let verdicts: Vec<&Entry> = manifest.entries.iter().filter(|e| e.kind == Kind::Verdict).collect();
     assert_eq!(verdicts.len(), 1, "seed 1 has a baseline alone");
     let names: Vec<&str> = verdicts[0].needs.iter().map(|&n| manifest.entries[n].variant.unwrap().name()).collect();
+    // A run that two tiers share is one policy.
     assert_eq!((verdicts[0].tier.as_str(), verdicts[0].seed, names), ("b", 0, vec!["tce-og", "bc"]));
 }
