@@ -356,8 +356,9 @@ fn a_sweep_whose_workers_are_killed_has_failed_and_says_why() {
     assert_eq!((shown.status.code(), &status["running"]), (Some(1), &serde_json::json!([])), "{status}");
     let failed = status["failed"].as_array().unwrap();
     assert!(!failed.is_empty() && failed.iter().all(|f| f[1].as_str().unwrap().contains("signal")), "{status}");
-    // Launched again, they are done.
-    assert!(tce(dir.path(), &launch).status.success());
+    // Launched again, as a user does, they are done.
+    let again = tce(dir.path(), &["sweep", "launch", "doomed", "--workers", "2"]);
+    assert!(again.status.success(), "{}", message(&again));
     assert!(tce(dir.path(), &["sweep", "status", "doomed"]).status.success());
 }
 
