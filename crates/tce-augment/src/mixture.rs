@@ -20,15 +20,9 @@ pub struct ScoredRows {
 
 /// The rows at `indices`, with their numbers.
 pub fn select(rows: &Transitions, scores: Option<&Vec<f32>>, indices: &[usize]) -> ScoredRows {
-    // How many rows before each have a number.
-    let before = |count: &mut usize, &known: &bool| {
-        let before = *count;
-        *count += usize::from(known);
-        Some(before)
-    };
     let scores = scores.map(|scores| {
-        let at: Vec<usize> = rows.known.iter().scan(0, before).collect();
-        Arc::new(indices.iter().filter(|&&i| rows.known[i]).map(|&i| scores[at[i]]).collect())
+        let by_row = rows.number_by_row(scores);
+        Arc::new(indices.iter().filter(|&&i| rows.known[i]).map(|&i| by_row[i]).collect())
     });
     ScoredRows { rows: Arc::new(rows.select(indices)), scores }
 }

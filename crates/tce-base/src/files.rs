@@ -49,6 +49,25 @@ impl FileError {
     }
 }
 
+/// How often a folder is made anew that other processes remove from above.
+const TRIES: usize = 100;
+
+/// Makes `folder` and the folders above it, where they are missing. Other processes may remove empty ones of these meanwhile, as that of
+/// [attempts](crate::ATTEMPTS) with the last attempt: they are made again.
+///
+/// # Errors
+/// The system's error, under the name `folder`.
+pub fn create_folder(folder: &Path) -> Result<(), FileError> {
+    let mut made = fs::create_dir_all(folder);
+    for _ in 1..TRIES {
+        match &made {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => made = fs::create_dir_all(folder),
+            _ => break,
+        }
+    }
+    made.map_err(|e| FileError::new(folder, "create the directory", e))
+}
+
 /// Checks that `path` can be written, with a temporary file in the nearest existing folder above it. Call it before long work whose
 /// result goes there.
 ///
@@ -181,7 +200,7 @@ fn beside<T>(
     make: impl FnOnce(&tempfile::Builder<'_, '_>, &Path) -> io::Result<T>,
 ) -> Result<T, FileError> {
     let directory = parent(target);
-    fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+    create_folder(directory)?;
     sweep(directory);
     let prefix = format!("{PREFIX}{}.", Owner::this());
     let mut builder = tempfile::Builder::new();

@@ -37,8 +37,8 @@ pub use auto::OrAuto;
 pub use checked::{Damage, JsonError, first_damaged, read_json, sha256_files, verify_sha256};
 pub use course::{Headline, LastStep, Step, begin_step, end_course, plan_course, resume_step};
 pub use files::{
-    AtomicFile, AtomicFolder, FileError, ensure_folder, ensure_writable, link_first, move_into_place, read_if_there,
-    sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
+    AtomicFile, AtomicFolder, FileError, create_folder, ensure_folder, ensure_writable, link_first, move_into_place,
+    read_if_there, sha256_file, sha256_hex, sha256_parts, write_atomically, write_json, write_json_first,
 };
 pub use interrupt::{Interrupted, interrupted, listen_for_interrupts, set_interrupted};
 pub use metrics::Metrics;

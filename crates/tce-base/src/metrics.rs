@@ -6,7 +6,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use crate::{FileError, read_if_there, write_atomically};
+use crate::{FileError, create_folder, read_if_there, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -31,7 +31,7 @@ impl Metrics {
         first: Vec<Line>,
         keep: impl Fn(&str, u64) -> bool,
     ) -> Result<Self, FileError> {
-        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        create_folder(directory)?;
         let path = directory.join("metrics.jsonl");
         let old = read_if_there(&path)?.unwrap_or_default();
         let old = String::from_utf8_lossy(&old);
@@ -129,7 +129,7 @@ struct Events {
 
 impl Events {
     fn create(directory: &Path) -> Result<Self, FileError> {
-        fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        create_folder(directory)?;
         let path = directory.join(format!("events.out.tfevents.{}.tce", now() as u64));
         let file = OpenOptions::new().create(true).append(true).open(&path);
         let mut events = Self { file: file.map_err(|e| FileError::new(&path, "open", e))?, path };

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::{FileError, Owner};
+use crate::{FileError, Owner, create_folder};
 
 /// The folder of attempts, beside what they are to become: its entries are named by their [`Owner`].
 pub const ATTEMPTS: &str = "attempts";
@@ -22,7 +22,7 @@ impl Scratch {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let name = format!("{}.{}", Owner::this(), COUNT.fetch_add(1, Ordering::Relaxed));
         let directory = beside.join(ATTEMPTS).join(name);
-        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        create_folder(&directory)?;
         Ok(Self { directory })
     }
 
@@ -56,6 +56,15 @@ impl Drop for Scratch {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Whoever removes the last attempt removes their folder, which another one may be about to use.
+    #[test]
+    fn the_folder_of_attempts_may_go_while_another_begins() {
+        let dir = tempfile::tempdir().unwrap();
+        let come_and_go = || (0..2_000).for_each(|_| drop(Scratch::new(dir.path()).unwrap()));
+        std::thread::scope(|scope| (0..3).for_each(|_| drop(scope.spawn(come_and_go))));
+        assert!(!dir.path().join(ATTEMPTS).exists());
+    }
 
     #[test]
     fn what_the_dead_left_goes_and_what_the_living_have_stays() {

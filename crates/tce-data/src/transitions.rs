@@ -190,6 +190,13 @@ impl Transitions {
         Cow::Owned(self.select(&rows))
     }
 
+    /// One number per row, of `numbers` that only rows with a known s' have, in their order; 0 for the others.
+    pub fn number_by_row(&self, numbers: &[f32]) -> Vec<f32> {
+        let mut next = numbers.iter();
+        let of = |known: &bool| if *known { next.next().copied().unwrap_or_default() } else { 0.0 };
+        self.known.iter().map(of).collect()
+    }
+
     /// Episodes in row order: each ends at a terminal, at a time-out, or at the last row.
     pub fn episodes(&self) -> Vec<Episode> {
         let mut episodes = Vec::new();

@@ -23,7 +23,6 @@ pub mod error;
 pub mod folder;
 pub mod html;
 pub mod merge;
-mod numbers;
 pub mod paper;
 pub mod permutation;
 pub mod record;

@@ -259,19 +259,21 @@ impl Inputs {
         }
     }
 
+    /// The better trajectories of the target, where not all of its rows are imitated.
+    fn chosen(&self, config: &TargetConfig) -> Option<Transitions> {
+        self.choice(config).map(|choice| self.target.complete().select(&choice.rows))
+    }
+
     /// The target rows that learners imitate. What only has to know the dynamics (label models, learned dynamics) takes all rows.
-    pub fn learned_from(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
-        match self.choice(config) {
-            Some(choice) => Cow::Owned(self.target.complete().select(&choice.rows)),
-            None => Cow::Borrowed(self.target.complete()),
-        }
+    pub fn learned_from(&self, config: &TargetConfig) -> Arc<Transitions> {
+        self.chosen(config).map_or_else(|| self.target.all_rows(), Arc::new)
     }
 
     /// Those of [`Self::learned_from`] whose successor is known, which the generator imitates.
     pub fn imitated(&self, config: &TargetConfig) -> Cow<'_, Transitions> {
-        match self.learned_from(config) {
-            Cow::Borrowed(_) => Cow::Borrowed(&self.target.rows),
-            Cow::Owned(rows) => Cow::Owned(rows.with_successors().into_owned()),
+        match self.chosen(config) {
+            Some(rows) => Cow::Owned(rows.with_successors().into_owned()),
+            None => Cow::Borrowed(&self.target.rows),
         }
     }
 

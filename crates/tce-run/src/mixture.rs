@@ -41,8 +41,7 @@ pub fn extra_rows(
     let selected: Option<Vec<ScoredRows>> = match mixture.source {
         SourceRows::None => None,
         SourceRows::All => {
-            let rows = Arc::new(inputs.source()?.complete().clone());
-            let all = ScoredRows { rows, scores: source_scores };
+            let all = ScoredRows { rows: inputs.source()?.all_rows(), scores: source_scores };
             Some(vec![all; seeds.len()])
         }
         SourceRows::Relabelled => {

@@ -9,7 +9,7 @@ use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
 use tce_learn::{DynamicsConfig, Mode, RowScores};
 use tce_nn::Device;
-use tce_report::analysis::counted;
+use tce_report::analysis::counts_for;
 use tce_zoo::actors::{Arena, Evaluation};
 
 use crate::augment::single_stage;
@@ -50,9 +50,9 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// What the seeds' policies count for ([`counted`]); one that could not act to the end has diverged.
+    /// What the seeds' policies count for ([`counts_for`]); one that could not act to the end has diverged.
     pub fn counted(&self) -> Vec<f64> {
-        let of = |(score, evaluation): (&Option<f64>, &Evaluation)| counted(*score, evaluation.failed.is_some());
+        let of = |(score, evaluation): (&Option<f64>, &Evaluation)| counts_for(*score, evaluation.failed.is_some());
         self.scores.iter().zip(&self.learned.evaluations).filter_map(of).collect()
     }
 
@@ -253,7 +253,7 @@ pub fn run(
 
 /// What every member learns from: the target's rows, and its `extra` ones.
 fn members(inputs: &Inputs, config: &Config, extra: Option<&[ScoredRows]>, seeds: &[u64]) -> Result<Vec<MemberData>> {
-    let target = Arc::new(inputs.learned_from(&config.target).into_owned());
+    let target = inputs.learned_from(&config.target);
     let mut trajectories = vec![target.clone()];
     if let (SourceRows::All, Some(extra)) = (config.mixture.source, extra) {
         // Generated rows are no trajectories.

@@ -19,7 +19,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use tce_base::metrics::Metrics;
 use tce_base::{
-    Damage, FileError, Owner, PROGRAM, link_first, read_json, sha256_files, sha256_hex, verify_sha256, write_json,
+    ATTEMPTS, Damage, FileError, Owner, PROGRAM, create_folder, link_first, read_json, sha256_files, sha256_hex,
+    verify_sha256, write_json,
 };
 use tce_nn::{Checkpoints, Device};
 
@@ -29,8 +30,6 @@ use crate::error::{Error, Result};
 
 /// Version of the computation. Increase it when the same specification gives other bytes.
 const FORMAT: u32 = 4;
-/// Where attempts are, in a stage.
-pub(crate) const ATTEMPTS: &str = "attempts";
 
 /// What marks a stage as done.
 #[derive(Serialize, Deserialize)]
@@ -63,7 +62,7 @@ impl Stage {
         DeviceKind::from(device).sign(&mut spec);
         let key = sha256_hex(spec.to_string().as_bytes());
         let directory = root.join(format!("{name}-{}", &key[..12]));
-        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        create_folder(&directory)?;
         let path = directory.join("spec.json");
         if !path.exists() {
             write_json(&path, &spec)?;
@@ -151,13 +150,12 @@ impl Stage {
         let n = COUNT.fetch_add(1, Ordering::Relaxed);
         let name = format!("{}.{n}", Owner::this());
         let attempts = self.directory.join(ATTEMPTS);
-        fs::create_dir_all(&attempts).map_err(|e| FileError::new(&attempts, "create the directory", e))?;
         let directory = attempts.join(&name);
-        let mut others: Vec<_> = fs::read_dir(&attempts)
-            .map_err(|e| FileError::new(&attempts, "read the directory", e))?
-            .flatten()
-            .map(|entry| (newest(&entry.path()), entry.path()))
-            .collect();
+        let mut others: Vec<_> = match fs::read_dir(&attempts) {
+            Ok(entries) => entries.flatten().map(|entry| (newest(&entry.path()), entry.path())).collect(),
+            Err(e) if e.kind() == ErrorKind::NotFound => Vec::new(),
+            Err(e) => return Err(FileError::new(&attempts, "read the directory", e).into()),
+        };
         others.sort();
         let mut taken = false;
         for (_, other) in others.into_iter().rev() {
@@ -171,7 +169,7 @@ impl Stage {
                 (true, false) => {}
             }
         }
-        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        create_folder(&directory)?;
         let clock = Clock::start(directory.join(format!("attempt.{}", clock::SUFFIX)));
         Ok(Attempt { stage: self.clone(), name, directory, clock })
     }

@@ -14,7 +14,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use tce_base::{first_damaged, read_if_there, read_json, sha256_files, sha256_hex, write_json};
@@ -220,7 +219,7 @@ impl TrainingRun<'_> {
 
     /// What every seed learns from.
     fn members(&self, inputs: &Inputs) -> Result<Vec<MemberData>> {
-        let target = Arc::new(inputs.learned_from(&self.config.target).into_owned());
+        let target = inputs.learned_from(&self.config.target);
         if let Some(choice) = inputs.choice(&self.config.target) {
             tce_base::note!("{}", choice.reason);
         }

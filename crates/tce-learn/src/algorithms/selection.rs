@@ -89,13 +89,8 @@ impl Scores {
 
 /// A number per row of part 1: the member's where s' is known, else 0.
 fn scores_of_rows(member: &Member) -> Option<Arc<Vec<f32>>> {
-    let (scores, known) = (member.row_scores.as_ref()?, &member.parts.get(1)?.known);
-    if scores.len() == known.len() {
-        return Some(scores.clone());
-    }
-    let mut next = scores.iter();
-    let of = |known: &bool| if *known { next.next().copied().unwrap_or_default() } else { 0.0 };
-    Some(Arc::new(known.iter().map(of).collect()))
+    let (scores, rows) = (member.row_scores.as_ref()?, member.parts.get(1)?);
+    Some(if scores.len() == rows.len() { scores.clone() } else { Arc::new(rows.number_by_row(scores)) })
 }
 
 /// Gives rows that cannot be scored, because their s' is not `known`, the score of the row before them, or of the last one

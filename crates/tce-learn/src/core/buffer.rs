@@ -13,7 +13,7 @@ use std::sync::{Arc, OnceLock};
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use tce_base::Streams;
+use tce_base::{Rng, Streams};
 use tce_data::{Standardizer, Transitions, continued};
 use tce_nn::burn::tensor::{Int, TensorData};
 use tce_nn::{Device, Tensor, tensor};
@@ -207,9 +207,14 @@ impl Buffer {
         Ok(Self { successors: true, ..self })
     }
 
-    /// Whether batches may hold row `i` of `part`, one of the parts.
-    pub(crate) fn draws(&self, part: &Transitions, i: usize) -> bool {
-        !self.successors || part.known[i]
+    /// A row of `part`, one of the parts, that batches may hold.
+    pub(crate) fn draw(&self, part: &Transitions, rng: &mut Rng) -> usize {
+        loop {
+            let i = rng.random_range(0..part.len());
+            if !self.successors || part.known[i] {
+                return i;
+            }
+        }
     }
 
     /// Rows of each of `parts` in the batch of `step`.
@@ -292,10 +297,7 @@ impl Buffer {
             target_rows = target_rows.min(split[0]);
             for (k, (part, &rows)) in member.parts.iter().zip(&split).enumerate() {
                 for _ in 0..rows {
-                    let mut i = rng.random_range(0..part.len());
-                    while !self.draws(part, i) {
-                        i = rng.random_range(0..part.len());
-                    }
+                    let i = self.draw(part, &mut rng);
                     self.push(member, part.observation(i), &mut s);
                     self.push(member, part.next_observation(i), &mut s2);
                     actions.extend_from_slice(part.action(i));

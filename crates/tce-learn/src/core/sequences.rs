@@ -18,7 +18,6 @@
 
 use std::sync::Arc;
 
-use rand::RngExt;
 use tce_data::Transitions;
 
 use crate::buffer::{Buffer, Member, Pick};
@@ -107,10 +106,7 @@ impl Trajectories {
         let mut out = Segments::default();
         for (part, (table, rows)) in self.tables.iter().zip(split(batch, &of.parts)).enumerate() {
             for _ in 0..rows {
-                let mut row = rng.random_range(0..table.rows.len());
-                while !buffer.draws(&table.rows, row) {
-                    row = rng.random_range(0..table.rows.len());
-                }
+                let row = buffer.draw(&table.rows, &mut rng);
                 table.push(buffer, member, row, [context, horizon], &mut out);
                 out.picks.push(Pick { part: part as u32, row: row as u32 });
             }

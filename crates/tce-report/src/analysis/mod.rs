@@ -239,7 +239,7 @@ impl Analysis {
 }
 
 /// What a policy counts for that has this score, if it has one, or that [diverged](DIVERGED).
-pub fn counted(score: Option<f64>, diverged: bool) -> Option<f64> {
+pub fn counts_for(score: Option<f64>, diverged: bool) -> Option<f64> {
     score.or(diverged.then_some(DIVERGED))
 }
 
@@ -247,7 +247,7 @@ pub fn counted(score: Option<f64>, diverged: bool) -> Option<f64> {
 pub fn score(run: &Run) -> Option<f64> {
     match run.member.verdict {
         Verdict::Score(score) => Some(score),
-        Verdict::Diverged(_) => counted(None, true),
+        Verdict::Diverged(_) => counts_for(None, true),
         Verdict::Unscored => None,
     }
 }

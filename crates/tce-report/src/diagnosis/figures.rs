@@ -6,8 +6,8 @@ use tce_diagnosis::{
     AtBound, Bounds, Coverage, Curve, Diagnosis, Embedding, ErrorOverDistance, Group, Memorisation, Reliability, Spread,
 };
 
+use super::numbers::number;
 use crate::html::parts::decades;
-use crate::numbers::number;
 use crate::svg::{self, Axis, Cloud, Frame, Line, Point, Scale, Series, Steps};
 
 const SIZE: (f64, f64) = (320.0, 220.0);

@@ -5,9 +5,9 @@ use tce_base::counted;
 use tce_data::Task;
 use tce_diagnosis::{Choice, Diagnosis};
 
+use super::numbers::plain;
 use crate::analysis::Analysis;
 use crate::html::words::term;
-use crate::numbers::plain;
 use crate::study::{Study, short};
 use crate::svg::minus;
 

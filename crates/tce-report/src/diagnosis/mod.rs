@@ -8,17 +8,18 @@ use tce_diagnosis::{Choice, Diagnosis};
 use crate::analysis::Analysis;
 use crate::html::parts::document;
 use crate::html::words::term;
-use crate::numbers::plain;
 use crate::study::{Study, order, short};
 
 mod explanation;
 mod figures;
 mod lambda;
+mod numbers;
 mod table;
 
 use explanation::explanation;
 use figures::{copies, coverage, distance, histograms, picture, reliability, theorem};
 use lambda::lambdas;
+use numbers::plain;
 use table::{bounds_table, figures_and_good, implied};
 
 /// The page of one diagnosis.

@@ -7,7 +7,7 @@ use tce_diagnosis::bounds::GRID;
 use tce_diagnosis::memorisation::BESIDE;
 use tce_diagnosis::{Bounds, Diagnosis, Implied};
 
-use crate::numbers::{number, plain};
+use super::numbers::{number, plain};
 use crate::svg::minus;
 
 /// Errors of implied actions in a table.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 use tce_base::first_damaged;
-use tce_report::analysis::counted;
+use tce_report::analysis::counts_for;
 
 use super::work::Outcome;
 use super::{Entry, Kind, Sweep};
@@ -33,9 +33,9 @@ pub struct Row {
 }
 
 impl Row {
-    /// What the run counts for in a table ([`counted`]).
+    /// What the run counts for in a table ([`counts_for`]).
     pub fn counted(&self) -> Option<f64> {
-        counted(self.score, self.diverged)
+        counts_for(self.score, self.diverged)
     }
 }
 

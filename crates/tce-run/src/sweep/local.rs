@@ -4,14 +4,14 @@
 //! launch waits for it, and does it if they are lost.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tce_base::format::about;
-use tce_base::{FileError, Headline, Progress, counted, interrupted};
+use tce_base::{FileError, Headline, Progress, counted, create_folder, interrupted};
 
 use super::{Entry, Sweep};
 use crate::device_kind::DeviceKind;
@@ -59,7 +59,7 @@ impl Sweep {
         self.forget_failure(entry);
         let path = self.log(entry);
         let directory = self.directory.join("logs");
-        fs::create_dir_all(&directory).map_err(|e| FileError::new(&directory, "create the directory", e))?;
+        create_folder(&directory)?;
         let log = File::options().create(true).append(true).open(&path);
         let log = log.map_err(|e| FileError::new(&path, "open", e))?;
         let mut command = Command::new(program);

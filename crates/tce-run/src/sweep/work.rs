@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use tce_base::{FileError, Owner, PROGRAM, interrupted, read_json, sha256_file, write_json, write_json_first};
+use tce_base::{
+    FileError, Owner, PROGRAM, create_folder, interrupted, read_json, sha256_file, write_json, write_json_first,
+};
 use tce_nn::Device;
-use tce_report::analysis::counted;
+use tce_report::analysis::counts_for;
 
 use super::claim::now;
 use super::{Entry, Kind, Sweep};
@@ -56,7 +58,7 @@ pub struct Outcome {
 impl Outcome {
     /// What the run counts for in a table, as in a report: a policy that diverged is no better than a random one.
     pub fn counted(&self) -> Option<f64> {
-        counted(self.score, self.diverged)
+        counts_for(self.score, self.diverged)
     }
 
     /// Whether two copies of the work have the same result.
@@ -286,7 +288,7 @@ impl Sweep {
         let verdict = recommend_or_only(evaluator, &candidates)?;
         let task = root.join(entry.task.directory());
         let place = task.join(format!("{VERDICT}-seed{}-{}", entry.seed, &entry.id[..12]));
-        fs::create_dir_all(&place).map_err(|e| FileError::new(&place, "create the directory", e))?;
+        create_folder(&place)?;
         // Relative to the task's folder, as that of `tce run` is.
         let policy = verdict.policy.strip_prefix(&task).unwrap_or(&verdict.policy).to_owned();
         let file = place.join("verdict.json");

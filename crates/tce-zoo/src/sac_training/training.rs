@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use tce_base::metrics::Metrics;
 use tce_base::random::fill_uniform;
-use tce_base::{FileError, Progress, Streams, interrupted, write_json};
+use tce_base::{Progress, Streams, create_folder, interrupted, write_json};
 use tce_data::{Agent, LoadOptions, ScoreTable, load};
 use tce_learn::sac::Sac;
 use tce_learn::{Buffer, Learner, Meter, PolicyLearner};
@@ -54,7 +54,7 @@ impl Training {
         // Checked before anything is written: a run that cannot start leaves no files behind.
         let begins = !Ledger::is_in(directory);
         let origin = from.filter(|_| begins).map(|from| Origin::of(from, settings.agent)).transpose()?;
-        std::fs::create_dir_all(directory).map_err(|e| FileError::new(directory, "create the directory", e))?;
+        create_folder(directory)?;
         let lock = lock(directory)?;
         let ledger = Ledger::newest_whole(directory)?;
         let (settings, origin) = match &ledger {

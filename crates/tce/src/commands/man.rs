@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use tce_base::{FileError, write_atomically};
+use tce_base::{FileError, create_folder, write_atomically};
 use tce_run::error::Result;
 
 /// Arguments of `man`.
@@ -17,7 +17,7 @@ pub struct Man {
 impl Man {
     /// Writes a page for every command.
     pub fn run(self, command: clap::Command) -> Result<()> {
-        std::fs::create_dir_all(&self.out).map_err(|e| FileError::new(&self.out, "create the directory", e))?;
+        create_folder(&self.out)?;
         let mut command = command.disable_help_subcommand(true);
         command.build();
         self.page(command, "tce")

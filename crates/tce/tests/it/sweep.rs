@@ -162,6 +162,14 @@ fn a_sweep_survives_its_launcher_and_its_workers() {
     assert_eq!(outcomes(&dir.path().join("killed")), expected);
 }
 
+/// A folder with the plan `out` of a small sweep.
+fn planned(out: &str, seeds: u64) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let file = describe(dir.path(), "s", seeds);
+    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", out]).status.success());
+    dir
+}
+
 /// A piece of work by its kind and method: its place in the list, and its id.
 fn piece(sweep: &Path, kind: &str, variant: Option<&str>) -> (usize, String) {
     let manifest = fs::read_to_string(sweep.join("manifest.jsonl")).unwrap();
@@ -186,9 +194,7 @@ fn touch(path: &Path, at: SystemTime) {
 
 #[test]
 fn work_of_another_launch_is_left_to_it_and_done_once_that_is_lost() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = describe(dir.path(), "s", 1);
-    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let dir = planned("s", 1);
     let sweep = dir.path().join("s");
     let ((index, source), (_, rows)) = (piece(&sweep, "source", None), piece(&sweep, "expand", None));
     let (_, clones) = piece(&sweep, "run", Some("bc"));
@@ -221,9 +227,7 @@ fn work_of_another_launch_is_left_to_it_and_done_once_that_is_lost() {
 
 #[test]
 fn two_launches_share_the_work() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = describe(dir.path(), "s", 2);
-    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let dir = planned("s", 2);
     let launch = ["sweep", "launch", "s", "--workers", "1"];
     for launcher in [(); 2].map(|()| in_group(dir.path(), &launch)) {
         let ended = launcher.wait_with_output().unwrap();
@@ -329,9 +333,7 @@ fn a_failure_is_kept_and_the_rest_is_done() {
 
 #[test]
 fn a_sweep_whose_workers_are_killed_has_failed_and_says_why() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = describe(dir.path(), "s", 1);
-    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "doomed"]).status.success());
+    let dir = planned("doomed", 1);
     // What went wrong yesterday is no reason of today's failures.
     let manifest = fs::read_to_string(dir.path().join("doomed/manifest.jsonl")).unwrap();
     let pieces = manifest.lines().filter_map(|line| {
@@ -356,8 +358,8 @@ fn a_sweep_whose_workers_are_killed_has_failed_and_says_why() {
     assert_eq!((shown.status.code(), &status["running"]), (Some(1), &serde_json::json!([])), "{status}");
     let failed = status["failed"].as_array().unwrap();
     assert!(!failed.is_empty() && failed.iter().all(|f| f[1].as_str().unwrap().contains("signal")), "{status}");
-    // Launched again, as a user does, they are done.
-    let again = tce(dir.path(), &["sweep", "launch", "doomed", "--workers", "2"]);
+    // Launched again, they are done.
+    let again = tce(dir.path(), &launch);
     assert!(again.status.success(), "{}", message(&again));
     assert!(tce(dir.path(), &["sweep", "status", "doomed"]).status.success());
 }
@@ -411,9 +413,7 @@ impl Fake {
 
 #[test]
 fn slurm_gets_what_is_missing_in_arrays_that_it_accepts() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = describe(dir.path(), "s", 4);
-    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let dir = planned("s", 4);
     let fake = Fake::new(dir.path(), 3, "");
     let launch = ["sweep", "launch", "s", "--launcher", "slurm", "--pack", "2", "--sbatch=--time=01:00:00", "--json"];
     let dry = fake.tce(dir.path(), &[&launch[..], &["--dry-run"]].concat());
@@ -445,9 +445,7 @@ fn slurm_gets_what_is_missing_in_arrays_that_it_accepts() {
 
 #[test]
 fn a_refusal_by_slurm_is_told_and_loses_nothing() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = describe(dir.path(), "s", 1);
-    assert!(tce(dir.path(), &["sweep", "plan", &file, "--out", "s"]).status.success());
+    let dir = planned("s", 1);
     let launch = ["sweep", "launch", "s", "--launcher", "slurm"];
     let refusing = Fake::new(dir.path(), 1001, "echo 'sbatch: error: invalid account' >&2; exit 1");
     let output = refusing.tce(dir.path(), &launch);

@@ -3,7 +3,7 @@
 use crate::svg::minus;
 
 /// With as many decimals as its size asks for.
-pub(crate) fn number(value: f64) -> String {
+pub(super) fn number(value: f64) -> String {
     let text = match value.abs() {
         0.0 => "0".into(),
         v if v >= 100.0 => format!("{value:.0}"),
@@ -15,6 +15,6 @@ pub(crate) fn number(value: f64) -> String {
 }
 
 /// A setting as it was written.
-pub(crate) fn plain(value: f64) -> String {
+pub(super) fn plain(value: f64) -> String {
     minus(format!("{value}"))
 }
