@@ -43,7 +43,7 @@ pub fn train(
     let config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
     let (own, device) = (robot.own().or_raise(py)?, settings.device().or_raise(py)?);
     let seeds = counted(wanted.first_seed, wanted.seeds).or_raise(py)?;
-    ensure_fits(&config.learner, LearnedRows::with(extra.as_ref())).or_raise(py)?;
+    ensure_fits(&config, LearnedRows::with(extra.as_ref())).or_raise(py)?;
     let comparison = if wanted.compare { Comparison::Recommend } else { Comparison::Skip };
     let target = target.rows.clone();
     let source = source.filter(|_| wanted.compare).map(|table| table.rows.clone());

@@ -167,6 +167,24 @@ pub enum SourceRows {
     Relabelled,
 }
 
+/// Which actions rows besides the target's are cloned with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RowActions {
+    /// Their own; a generated row's is inferred by the inverse dynamics.
+    #[default]
+    Own,
+    /// Those of clones of the target rows in the same states. Only `bc` can learn from such rows: these actions do not lead to the rows' next
+    /// states.
+    Clones,
+}
+
+impl RowActions {
+    fn is_own(&self) -> bool {
+        *self == Self::Own
+    }
+}
+
 /// The data the policy is learned from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -178,9 +196,29 @@ pub struct MixtureConfig {
     /// λ, the share of source rows in the mixture; the rest are generated. Source: Eq. 9, Table C.5.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lambda: f64,
+    /// Which actions generated and source rows are cloned with.
+    // Runs that were done before there was this key have the rows' own, and keep their keys.
+    #[serde(default, skip_serializing_if = "RowActions::is_own")]
+    pub actions: RowActions,
 }
 
 impl MixtureConfig {
+    /// The target's rows alone.
+    pub fn none() -> Self {
+        Self { generated: GeneratedRows::None, source: SourceRows::None, lambda: 0.0, actions: RowActions::Own }
+    }
+
+    /// What a run depends on: target rows keep their actions.
+    pub fn used(&self) -> Self {
+        let actions = if self.by_clones() { RowActions::Clones } else { RowActions::Own };
+        Self { actions, ..self.clone() }
+    }
+
+    /// Whether clones of the target rows are learned first, for the actions of other rows.
+    pub fn by_clones(&self) -> bool {
+        self.actions == RowActions::Clones && self.learned_rows() == LearnedRows::Mixed
+    }
+
     /// Whether rows besides the target's are learned from.
     pub fn learned_rows(&self) -> LearnedRows {
         match (self.generated, self.source) {
@@ -220,6 +258,27 @@ fn ensure_layers(path: &str, value: &serde_json::Value) -> Result<()> {
 }
 
 impl Config {
+    /// Clones of the target rows alone, with the same settings: an ensemble, where `learner.bc` is one.
+    pub fn of_clones(&self) -> Self {
+        Self { mixture: MixtureConfig::none(), learner: self.learner.of_clones(), ..self.clone() }
+    }
+
+    /// Refuses actions of clones for a learner that has to know where actions lead to.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn ensure_actions(&self, rows: LearnedRows) -> Result<()> {
+        let algorithm = self.learner.algorithm;
+        if rows == LearnedRows::Target || self.mixture.actions == RowActions::Own || algorithm == Algorithm::Bc {
+            return Ok(());
+        }
+        Err(Error::Usage(format!(
+            "mixture.actions = \"clones\": found the learner {}, expected bc: actions of clones do not lead to the rows' next states, which \
+             other learners learn from; use mixture.actions = \"own\", or the learner bc",
+            algorithm.about().name
+        )))
+    }
+
     /// The ranges that types cannot express.
     pub fn validate(&self) -> Result<()> {
         let within = |key: &str, value: f64, low: f64, high: f64| match value {
@@ -286,6 +345,7 @@ impl Config {
                 )));
             }
         }
+        self.ensure_actions(self.mixture.learned_rows())?;
         if self.mixture.generated == GeneratedRows::Tce && self.generator.rows == 0 && self.mixture.lambda == 1.0 {
             return Err(Error::Usage(
                 "generator.rows = 0 means (1 - mixture.lambda) times the source rows, which is none at mixture.lambda = 1; give \

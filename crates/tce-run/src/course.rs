@@ -12,6 +12,7 @@ use tce_nn::Device;
 
 use crate::config::{Algorithm, Config, GeneratedRows, SourceRows};
 use crate::device_kind::DeviceKind;
+use crate::variant::Variant;
 
 /// The file with costs, in the folder of runs.
 const COSTS: &str = "costs.json";
@@ -110,6 +111,14 @@ impl<'a> Course<'a> {
         }
     }
 
+    /// The clones whose actions other rows get, where `config` says so; those that an earlier method of the command is are there already.
+    pub fn clones(&mut self, config: &Config) {
+        let name = Variant::BcEnsemble.name();
+        if config.mixture.by_clones() && !self.steps.iter().any(|step| step.name == training_step(name)) {
+            self.training(name, &config.of_clones(), LearnedRows::Target);
+        }
+    }
+
     /// The comparison of `policies` policies.
     pub fn verdict(&mut self, config: &Config, policies: usize) {
         let dynamics = json!(config.dynamics);
@@ -134,7 +143,6 @@ pub fn training_step(name: &str) -> String {
 mod tests {
     use super::*;
     use crate::layers::{Layered, Preset};
-    use crate::variant::Variant;
 
     #[test]
     fn what_an_earlier_method_has_made_costs_nothing() {

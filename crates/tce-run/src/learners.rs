@@ -142,6 +142,11 @@ impl Algorithm {
 }
 
 impl LearnerConfig {
+    /// Clones of all rows, with the same settings: the baseline of a policy.
+    pub fn of_clones(&self) -> Self {
+        Self { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..self.clone() }
+    }
+
     /// The configuration of the chosen algorithm.
     pub fn own(&self) -> &dyn Method {
         self.method(self.algorithm)

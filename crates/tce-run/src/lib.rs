@@ -24,6 +24,7 @@
 
 pub mod augment;
 mod clock;
+mod clones;
 pub mod config;
 pub mod course;
 pub mod device_kind;

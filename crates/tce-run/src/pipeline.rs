@@ -7,13 +7,14 @@ use serde::{Deserialize, Serialize};
 use tce_augment::config::{FilterConfig, GeneratorConfig, LabelsConfig};
 use tce_augment::mixture::ScoredRows;
 use tce_base::{write_atomically, write_json};
-use tce_learn::{DynamicsConfig, Mode, RowScores};
+use tce_learn::{DynamicsConfig, LearnedRows, Mode, RowScores};
 use tce_nn::Device;
 use tce_report::analysis::counts_for;
 use tce_zoo::actors::{Arena, Evaluation};
 
 use crate::augment::single_stage;
 use crate::augment::{Generated, augment_rows, label_models};
+use crate::clones::take_actions;
 use crate::config::{Config, EvaluationConfig, GeneratedRows, MixtureConfig, SourceRows, used_of_single_stage};
 use crate::error::{Error, Result};
 use crate::inputs::{Domains, InputSpec, Inputs};
@@ -21,6 +22,7 @@ use crate::methods::{negated_costs, row_scores};
 use crate::mixture::{distances, extra_rows};
 use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
 use crate::stage::Stage;
+use crate::variant::Variant;
 
 /// The outcome of a variant.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,6 +42,9 @@ pub struct Summary {
     pub extra_rows: usize,
     /// The generated rows, per member; empty if there are none.
     pub generated: Vec<Generated>,
+    /// How far the actions of clones are from the own ones of the rows that have them, per member ([`take_actions`]); empty if none have.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub action_distances: Vec<f64>,
     /// Seconds from data to scores, without stages that were finished before. Interrupted attempts count up to their last checkpoint.
     pub seconds: f64,
     /// The directory of the run.
@@ -67,7 +72,7 @@ impl Summary {
 struct RunSpec<'a> {
     inputs: InputSpec,
     seeds: &'a [u64],
-    mixture: &'a MixtureConfig,
+    mixture: MixtureConfig,
     learner: serde_json::Value,
     evaluation: &'a EvaluationConfig,
     generator: Option<&'a GeneratorConfig>,
@@ -83,7 +88,7 @@ impl<'a> RunSpec<'a> {
         Self {
             inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
-            mixture: &config.mixture,
+            mixture: config.mixture.used(),
             learner: config.learner.used(),
             evaluation: &config.evaluation,
             generator: config.uses("generator").then_some(&config.generator),
@@ -110,6 +115,7 @@ impl Config {
                 used.is_some_and(|used| used.get(table).is_some())
             }
             "learner" => self.learner.used().get(table).is_some(),
+            "mixture" if table == "actions" => self.mixture.learned_rows() == LearnedRows::Mixed,
             "source" => self.needs_source(),
             // Verdicts on files of one's own alone.
             "fitted_q" => false,
@@ -197,6 +203,7 @@ pub fn run(
     write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
     let mut files = vec!["config.toml".to_owned()];
 
+    let clones = clones(inputs, config, seeds, root, place, device)?;
     let (mut reports, mut tables) = (Vec::new(), None);
     if generated {
         let augmentation = augment_rows(inputs, config, seeds, root, device)?;
@@ -213,7 +220,8 @@ pub fn run(
     if let Some(choice) = inputs.choice(&config.target) {
         tce_base::note!("{name}: {}", choice.reason);
     }
-    let data = members(inputs, config, extra.as_deref(), seeds)?;
+    let mut data = members(inputs, config, extra.as_deref(), seeds)?;
+    let action_distances = take_actions(&mut data, &clones)?;
     let arena = match (inputs.agent, inputs.shift) {
         (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
@@ -236,6 +244,7 @@ pub fn run(
         learned,
         extra_rows: extra_count,
         generated: reports,
+        action_distances,
         seconds: attempt.seconds(),
         directory: stage.directory().to_owned(),
         data: inputs.files(),
@@ -249,6 +258,24 @@ pub fn run(
     files.push(result);
     attempt.finish(&files, &summary)?;
     Ok(summary)
+}
+
+/// The policies whose actions other rows get, one per seed: clones of the target rows, which are a run of their own beside this one. None
+/// where rows keep their actions.
+fn clones(
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    place: &str,
+    device: &Device,
+) -> Result<Vec<PathBuf>> {
+    match config.mixture.by_clones() {
+        false => Ok(Vec::new()),
+        true => {
+            Ok(run(Variant::BcEnsemble.name(), inputs, &config.of_clones(), seeds, root, place, device)?.policies())
+        }
+    }
 }
 
 /// What every member learns from: the target's rows, and its `extra` ones.

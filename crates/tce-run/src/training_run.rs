@@ -22,7 +22,8 @@ use tce_learn::{LearnedRows, OtherRows, Policy};
 use tce_nn::Device;
 use tce_zoo::actors::Arena;
 
-use crate::config::{Algorithm, Config, LearnerConfig};
+use crate::clones::take_actions;
+use crate::config::{Algorithm, Config, LearnerConfig, RowActions};
 use crate::course::{Course, training_step};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
@@ -139,11 +140,12 @@ pub fn ensure_own_folder(out: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Refuses options that `learner` has no use for, and a training without other `rows` that it needs.
+/// Refuses options that the learner of `config` has no use for, and a training without other `rows` that it needs.
 ///
 /// # Errors
 /// Names the option.
-pub fn ensure_fits(learner: &LearnerConfig, rows: LearnedRows) -> Result<()> {
+pub fn ensure_fits(config: &Config, rows: LearnedRows) -> Result<()> {
+    let learner = &config.learner;
     let method = learner.algorithm.about();
     if learner.top < 1.0 && learner.algorithm != Algorithm::Bc {
         return Err(Error::Usage(format!(
@@ -157,7 +159,7 @@ pub fn ensure_fits(learner: &LearnerConfig, rows: LearnedRows) -> Result<()> {
             method.name
         )));
     }
-    Ok(())
+    config.ensure_actions(rows)
 }
 
 /// One of the trainings of a run.
@@ -180,7 +182,7 @@ impl TrainingRun<'_> {
     /// If the learner needs other rows than there are, the directory holds another run, training fails, or the user interrupts.
     pub fn run(&self, inputs: &Inputs, device: &Device) -> Result<Trained> {
         ensure_own_folder(self.out)?;
-        ensure_fits(&self.config.learner, LearnedRows::with(inputs.extra.as_ref()))?;
+        ensure_fits(self.config, LearnedRows::with(inputs.extra.as_ref()))?;
         inputs.ensure_episodes(&self.config.learner)?;
         let (out, seeds) = (self.out, self.seeds);
         let method = self.config.learner.algorithm.about();
@@ -190,12 +192,17 @@ impl TrainingRun<'_> {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
         }
-        let data = self.members(inputs)?;
+        let mut data = self.members(inputs)?;
         let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
         write_json(&out.join(SPEC), &spec)?;
         tce_base::write_atomically(&out.join(CONFIG), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
-        let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect();
+        let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect::<Vec<_>>();
+        let first =
+            self.clones_first(inputs).then(|| self.baseline(alone.clone(), &key, inputs, device)).transpose()?;
+        if let Some(clones) = &first {
+            take_actions(&mut data, &clones.files)?;
+        }
         let training = Training { name: method.name, data, learner: &self.config.learner, arena, directory: out };
         let (policies, learned) = self.train(training, &key, inputs, device)?;
         let verdict = match self.comparison {
@@ -207,7 +214,10 @@ impl TrainingRun<'_> {
                     false => format!("{} with the extra rows", method.name),
                 };
                 let own = Candidate { name, baseline: alone_is_baseline, files: policies.clone() };
-                let baseline = (!alone_is_baseline).then(|| self.baseline(alone, &key, inputs, device)).transpose()?;
+                let baseline = match first {
+                    None if !alone_is_baseline => Some(self.baseline(alone, &key, inputs, device)?),
+                    first => first,
+                };
                 Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
             }
         };
@@ -267,15 +277,16 @@ impl TrainingRun<'_> {
 
     /// Trains the baseline: an ensemble of clones of the target rows per seed, in `baseline/`.
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
-        let learner = self.baseline_learner();
+        let learner = self.config.learner.of_clones();
         let directory = self.out.join(BASELINE_FOLDER);
         let training = Training { name: BASELINE, data, learner: &learner, arena: None, directory: &directory };
         let (files, _) = self.train(training, key, inputs, device)?;
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 
-    fn baseline_learner(&self) -> LearnerConfig {
-        LearnerConfig { algorithm: Algorithm::Bc, standardise: true, top: 1.0, ..self.config.learner.clone() }
+    /// Whether the baseline is trained first, because the extra rows get its actions.
+    fn clones_first(&self, inputs: &Inputs) -> bool {
+        inputs.extra.is_some() && self.config.mixture.actions == RowActions::Clones
     }
 
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
@@ -310,11 +321,15 @@ impl TrainingRun<'_> {
         let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
         let learned = LearnedRows::with(inputs.extra.as_ref());
+        let baseline = |course: &mut Course| course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
+        let first = self.clones_first(inputs);
+        if first {
+            baseline(&mut course);
+        }
         course.training(config.learner.algorithm.about().name, config, learned);
         if self.comparison == Comparison::Recommend {
-            if learned == LearnedRows::Mixed {
-                let baseline = Config { learner: self.baseline_learner(), ..config.clone() };
-                course.training(BASELINE, &baseline, LearnedRows::Target);
+            if learned == LearnedRows::Mixed && !first {
+                baseline(&mut course);
             }
             if only_reward(inputs.target.complete()).is_none() {
                 let policies = seeds * if learned == LearnedRows::Mixed { 2 } else { 1 };

@@ -216,12 +216,15 @@ impl Manifest {
             lacking.iter().filter(|(_, why)| why.is_some()).map(|((task, _), _)| *task).collect();
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
-        let mut verdicts = Verdicts::default();
+        let (mut verdicts, mut by_clones) = (Verdicts::default(), BTreeSet::new());
         for (part, own) in parts.iter().zip(&runs) {
             for (task, variant, label, config) in own.iter().filter(|r| !without.contains(&r.0)) {
                 for seed in part.seeds.clone() {
                     let run = plan.add_run(&mut known, &part.name, (*task, *variant, label), config, seed);
                     verdicts.add((*task, seed), run);
+                    if config.mixture.by_clones() {
+                        by_clones.insert(run);
+                    }
                 }
             }
             if description.verdicts {
@@ -240,7 +243,19 @@ impl Manifest {
             let (are, their) = if without.len() == 1 { ("task is", "its") } else { ("tasks are", "their") };
             tce_base::note!("{} {are} left out, because {their} data cannot be had ({tasks}):\n{list}", without.len());
         }
+        plan.clones_before(&by_clones);
         Ok(plan.sorted())
+    }
+
+    /// Runs whose rows get the actions of clones, `by_clones`, come behind the run of these clones, where the sweep has one.
+    fn clones_before(&mut self, by_clones: &BTreeSet<usize>) {
+        let clones = |e: &Entry| e.variant == Some(Variant::BcEnsemble) && e.label.is_empty();
+        let runs: BTreeMap<(Task, u64), usize> =
+            self.entries.iter().enumerate().filter(|(_, e)| clones(e)).map(|(i, e)| ((e.task, e.seed), i)).collect();
+        for &run in by_clones {
+            let Entry { task, seed, needs, .. } = &mut self.entries[run];
+            needs.extend(runs.get(&(*task, *seed)));
+        }
     }
 
     /// The place of `entry`, which is added unless it is there.

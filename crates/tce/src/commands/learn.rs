@@ -68,7 +68,7 @@ impl Learn {
         self.config = self.config.with_own_tables(self.learner, self.top);
         let config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        ensure_fits(&config.learner, LearnedRows::with(self.extra.as_ref()))?;
+        ensure_fits(&config, LearnedRows::with(self.extra.as_ref()))?;
         super::refuse::folder(&out)?;
         self.config.config.as_deref().map_or(Ok(()), |config| ensure_config_stays(config, &out))?;
         ensure_own_folder(&out)?;

@@ -132,6 +132,7 @@ impl Run {
         let mut course = Course::new(self.task.agent, seeds, device, &self.data.out);
         course.step("data", serde_json::json!(self.task));
         for ((variant, _), config) in variants.iter().zip(configs) {
+            course.clones(config);
             course.generating(config);
             course.training(variant.name(), config, config.mixture.learned_rows());
         }

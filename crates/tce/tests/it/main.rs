@@ -1,6 +1,7 @@
 //! The program, end to end. One binary: linking each file by itself takes longer than the tests.
 
 mod bad_input;
+mod clones;
 mod common;
 mod diagnose;
 mod gpu;

@@ -27,6 +27,7 @@ run hopper-morph/medium/expert --set learner.steps=2.5
 run hopper-morph/medium/expert --set learner.algorithm=td3bc
 run hopper-morph/medium/expert --set filter.enabled=maybe
 run hopper-morph/medium/expert --learner cql
+run hopper-morph/medium/expert --learner iql --set mixture.actions=clones
 run hopper-morph/medium/expert --seeds 0
 run hopper-morph/medium/expert --config nofile.toml
 run hopper-morph/medium/expert --out notes.txt
@@ -40,6 +41,7 @@ learn --target target.hdf5 --out notes.txt/out
 learn --target target.hdf5 --out out --learner dara
 learn --target target.hdf5 --source ant.hdf5 --out out
 learn --target target.hdf5 --extra target.hdf5 --out out
+learn --target target.hdf5 --extra source.hdf5 --out out --learner iql --set mixture.actions=clones --set mixture.generated=none
 learn --target target.hdf5 --out out --set target.rows=3
 learn --target target.hdf5 --out out --set learner.bc.actor.hidden=[256,0]
 augment --source target.hdf5 --target target.hdf5 --out wider.hdf5

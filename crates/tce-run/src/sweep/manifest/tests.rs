@@ -68,6 +68,39 @@ fn prior_methods_share_their_generated_rows() {
     assert_eq!(manifest.entries.iter().filter(|e| e.kind == Kind::Augment).count(), 2 * (2 + 2));
 }
 
+/// Rows that get the actions of clones wait for these, where the sweep has them; without, the run learns them itself.
+#[test]
+fn clones_come_before_the_rows_that_get_their_actions() {
+    let tiers = |first: &str| {
+        format!(
+            r#"
+            tasks = ["hopper-morph:medium->expert"]
+            baselines = false
+            seeds = 2
+            tiers = [
+                {{ name = "a", variants = ["tce-og", {first}] }},
+                {{ name = "b", variants = ["tce-og"], overrides = [{{ name = "c", set = ["mixture.actions=clones"] }}] }},
+            ]
+            "#
+        )
+    };
+    for (first, expected) in [("\"bc-ensemble\"", Some(Variant::BcEnsemble)), ("\"bc\"", None)] {
+        let manifest = plan(&tiers(first)).unwrap();
+        let by_clones: Vec<&Entry> = manifest.entries.iter().filter(|e| e.label == "c").collect();
+        assert_eq!(by_clones.len(), 2);
+        for run in by_clones {
+            let runs: Vec<_> =
+                run.needs.iter().map(|&n| &manifest.entries[n]).filter(|e| e.kind == Kind::Run).collect();
+            let of = runs.iter().map(|e| (e.variant, e.seed)).collect::<Vec<_>>();
+            assert_eq!(of, expected.iter().map(|&v| (Some(v), run.seed)).collect::<Vec<_>>());
+            assert!(run.needs.iter().all(|&n| n < run.index));
+        }
+        // Their own actions wait for nothing.
+        let own = manifest.entries.iter().find(|e| e.variant == Some(Variant::TceOg) && e.label.is_empty()).unwrap();
+        assert!(own.needs.iter().all(|&n| manifest.entries[n].kind != Kind::Run));
+    }
+}
+
 #[test]
 fn a_plan_reads_back_and_damage_is_noticed() {
     let manifest = plan(TWO).unwrap();

@@ -1,0 +1,79 @@
+//! Other rows with the actions of clones of the target rows (`mixture.actions = "clones"`), through the real binary.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use crate::common::{TINY, data_pair, message, random_rows, tce, tce_json};
+use tce_data::{Agent, Shift, save_d4rl};
+
+const CLONES: [&str; 2] = ["--set", "mixture.actions=clones"];
+
+fn policy(folder: &Path) -> Vec<u8> {
+    fs::read(folder.join("policy-seed0.safetensors")).unwrap()
+}
+
+/// The clones are those of the baseline: they are learned once, by whichever comes first.
+#[test]
+fn a_run_shares_its_clones_with_the_baseline() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
+    let run = |variant: &str, more: &[&str]| {
+        let mut args =
+            vec!["run", "hopper-morph/medium/expert", "--variant", variant, "--no-baselines", "--no-verdict"];
+        args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap(), "--out", "out"]);
+        let row = tce_json(dir.path(), &[&args, TINY, more].concat())["rows"][0].clone();
+        let folder = dir.path().join(row["directory"].as_str().unwrap());
+        (row, folder)
+    };
+    let (row, by_clones) = run("tce-og", &CLONES);
+    let differ = row["action_distances"][0].as_f64().unwrap();
+    assert!(differ > 0.01, "random actions are not what a clone says: {differ}");
+    let folders = || fs::read_dir(dir.path().join("out/hopper-morph_medium-to-expert")).unwrap().count();
+    assert_eq!(folders(), 2, "the clones, and the policy");
+    let before = fs::metadata(&by_clones).unwrap().modified().unwrap();
+
+    // With and without the setting the clones of the target rows are the same run.
+    let (alone, clones) = run("bc-ensemble", &[]);
+    assert_eq!(run("bc-ensemble", &CLONES).1, clones);
+    assert_eq!((folders(), alone["action_distances"].is_null()), (2, true));
+    let (row, own) = run("tce-og", &[]);
+    assert!(row["action_distances"].is_null() && folders() == 3);
+    assert!(policy(&own) != policy(&by_clones) && policy(&clones) != policy(&by_clones));
+    assert_eq!(run("tce-og", &CLONES).1, by_clones);
+    assert_eq!(fs::metadata(&by_clones).unwrap().modified().unwrap(), before, "it is done once");
+}
+
+/// What the rows of a third file did does not matter then, only where they were.
+#[test]
+fn a_training_on_own_files_takes_no_notice_of_the_rows_actions() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    data_pair(dir, Agent::Hopper, Shift::Morph);
+    let rows = random_rows(Agent::Hopper, Shift::Morph, 300, 5);
+    let mut others = rows.clone();
+    others.actions.iter_mut().for_each(|a| *a = -*a);
+    save_d4rl(&dir.join("rows.hdf5"), &rows, &BTreeMap::new(), &[]).unwrap();
+    save_d4rl(&dir.join("others.hdf5"), &others, &BTreeMap::new(), &[]).unwrap();
+    let learn = |extra: &str, out: &str, more: &[&str]| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", extra, "--out", out, "--learner", "bc"];
+        tce(dir, &[&args, TINY, more].concat())
+    };
+    let learned = |extra: &str, out: &str, more: &[&str]| {
+        let output = learn(extra, out, more);
+        assert!(output.status.success(), "{}", message(&output));
+        (policy(&dir.join(out)), message(&output))
+    };
+    let alone = ["--no-verdict"];
+    let (by_clones, told) = learned("rows.hdf5", "a", &[&CLONES[..], &alone].concat());
+    assert!(told.contains("other rows have the actions of clones of the target rows, which are 0."), "{told}");
+    assert!(dir.join("a/baseline").is_dir(), "the clones are the baseline");
+    assert!(by_clones == learned("others.hdf5", "b", &[&CLONES[..], &alone].concat()).0);
+    assert!(learned("rows.hdf5", "c", &alone).0 != learned("others.hdf5", "d", &alone).0);
+
+    // With a verdict it is the same policy beside the same baseline, and clones are learned once.
+    let (compared, told) = learned("rows.hdf5", "a", &CLONES);
+    assert!(compared == by_clones && told.contains("cloning the target rows: learned before"), "{told}");
+    let summary: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("a/summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["verdict"]["tried"].as_array().unwrap().len(), 2, "{summary}");
+}
