@@ -61,7 +61,10 @@ pub fn create_folder(folder: &Path) -> Result<(), FileError> {
     let mut made = fs::create_dir_all(folder);
     for _ in 1..TRIES {
         match &made {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => made = fs::create_dir_all(folder),
+            // It was there, and was no folder a moment later; or one above it was gone. A file in its place fails every time.
+            Err(e) if matches!(e.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
+                made = fs::create_dir_all(folder);
+            }
             _ => break,
         }
     }
