@@ -51,7 +51,7 @@ pub use crate::policies::{actor, import, onnx};
 use crate::policies::{mlp_policy, npy, policy, sequence_policy};
 
 pub use actor::{ActionReduction, Actor, ActorConfig, PolicyForm};
-pub use bc::{Bc, BcConfig, CloneLoss};
+pub use bc::{Bc, BcConfig, CloneLoss, ScaleBy};
 pub use blocks::map_rows;
 pub use bosa::{Bosa, BosaConfig};
 pub use buffer::{Buffer, Member, Minibatch, Pick, RewardScale, best_trajectories, return_range_scale};

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use tce_learn::{
     About, BcConfig, BosaConfig, DaraConfig, DmcConfig, IgdfConfig, IqlConfig, LearnError, LearnedRows, MetaDtConfig,
-    Method, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, SrpoConfig, Td3BcConfig,
+    Method, Mode, OtdfConfig, RebracConfig, RegulariserConfig, RegulariserKind, ScaleBy, SrpoConfig, Td3BcConfig,
 };
 
 use crate::error::{Error, Result};
@@ -199,6 +199,21 @@ impl LearnerConfig {
             used["iql"] = serde_json::json!(iql);
         }
         used
+    }
+
+    /// [`Self::used`] for a training on these rows.
+    pub fn used_on(&self, rows: LearnedRows) -> serde_json::Value {
+        let mut used = self.used();
+        if let (LearnedRows::Target, Some(table)) = (rows, used["bc"].as_object_mut()) {
+            // There is one table to scale by.
+            table.remove("scale_by");
+        }
+        used
+    }
+
+    /// Whether observations are scaled by the target's rows alone, whatever others there are.
+    pub fn scales_by_target(&self) -> bool {
+        self.algorithm == Algorithm::Bc && self.bc.scale_by == ScaleBy::Target
     }
 
     /// Refuses numbers out of range, in the tables of all methods.

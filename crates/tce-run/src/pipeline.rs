@@ -21,7 +21,7 @@ use crate::inputs::{Domains, InputSpec, Inputs};
 use crate::methods::{negated_costs, row_scores};
 use crate::mixture::{distances, extra_rows};
 use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
-use crate::stage::Stage;
+use crate::stage::{Attempt, Stage};
 use crate::variant::Variant;
 
 /// The outcome of a variant.
@@ -89,7 +89,7 @@ impl<'a> RunSpec<'a> {
             inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
             mixture: config.mixture.used(),
-            learner: config.learner.used(),
+            learner: config.learner.used_on(config.mixture.learned_rows()),
             evaluation: &config.evaluation,
             generator: config.uses("generator").then_some(&config.generator),
             filter: config.uses("filter").then_some(&config.filter),
@@ -106,7 +106,9 @@ impl Config {
         let (section, rest) = key.split_once('.').unwrap_or((key, ""));
         let table = rest.split('.').next().unwrap_or_default();
         let two_stages = self.mixture.generated == GeneratedRows::Tce;
+        let mixed = self.mixture.learned_rows() == LearnedRows::Mixed;
         match section {
+            _ if ["mixture.actions", "learner.bc.scale_by"].contains(&key) && !mixed => false,
             "generator" | "filter" => two_stages,
             "labels" => two_stages || self.mixture.source == SourceRows::Relabelled,
             "dynamics" => two_stages && self.filter.by_dynamics(),
@@ -115,7 +117,6 @@ impl Config {
                 used.is_some_and(|used| used.get(table).is_some())
             }
             "learner" => self.learner.used().get(table).is_some(),
-            "mixture" if table == "actions" => self.mixture.learned_rows() == LearnedRows::Mixed,
             "source" => self.needs_source(),
             // Verdicts on files of one's own alone.
             "fitted_q" => false,
@@ -190,13 +191,12 @@ pub fn run(
 ) -> Result<Summary> {
     inputs.ensure_episodes(&config.learner)?;
     let inputs = &*inputs.seen_by(config);
-    let generated = config.mixture.generated != GeneratedRows::None;
-    let relabelled = config.mixture.source == SourceRows::Relabelled;
     let spec = RunSpec::new(inputs, config, seeds);
     let stage = Stage::open(root, &format!("{place}/{name}"), &spec, device)?;
     if let Some(summary) = stage.summary::<Summary>()? {
         tce_base::note!("{name}: done before, in {}", stage.directory().display());
-        return Ok(summary);
+        // The folder may have been moved since.
+        return Ok(Summary { directory: stage.directory().to_owned(), ..summary });
     }
     tce_base::note!("{name}: {}", stage.directory().display());
     let attempt = stage.attempt()?;
@@ -204,19 +204,7 @@ pub fn run(
     let mut files = vec!["config.toml".to_owned()];
 
     let clones = clones(inputs, config, seeds, root, place, device)?;
-    let (mut reports, mut tables) = (Vec::new(), None);
-    if generated {
-        let augmentation = augment_rows(inputs, config, seeds, root, device)?;
-        files.extend(augmentation.link_into(&attempt)?);
-        reports = augmentation.reports;
-        let scored = augmentation.tables.into_iter().zip(augmentation.scores);
-        tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
-    }
-    let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
-    let scores = config.source_scores(inputs, root)?;
-    let extra = extra_rows(inputs, config, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
-    drop((tables, models));
-
+    let (extra, reports) = other_rows(inputs, config, seeds, root, &attempt, &mut files, device)?;
     if let Some(choice) = inputs.choice(&config.target) {
         tce_base::note!("{name}: {}", choice.reason);
     }
@@ -276,6 +264,32 @@ fn clones(
             Ok(run(Variant::BcEnsemble.name(), inputs, &config.of_clones(), seeds, root, place, device)?.policies())
         }
     }
+}
+
+/// The rows besides the target's, per member; None for target rows alone. And what there is to tell of generated ones: their files are linked
+/// into `attempt`, and added to `files`.
+fn other_rows(
+    inputs: &Inputs,
+    config: &Config,
+    seeds: &[u64],
+    root: &Path,
+    attempt: &Attempt,
+    files: &mut Vec<String>,
+    device: &Device,
+) -> Result<(Option<Vec<ScoredRows>>, Vec<Generated>)> {
+    let (mut reports, mut tables) = (Vec::new(), None);
+    if config.mixture.generated != GeneratedRows::None {
+        let augmentation = augment_rows(inputs, config, seeds, root, device)?;
+        files.extend(augmentation.link_into(attempt)?);
+        reports = augmentation.reports;
+        let scored = augmentation.tables.into_iter().zip(augmentation.scores);
+        tables = Some(scored.map(|(rows, scores)| ScoredRows { rows, scores }).collect::<Vec<_>>());
+    }
+    let relabelled = config.mixture.source == SourceRows::Relabelled;
+    let models = if relabelled { Some(label_models(inputs, &config.labels, seeds, root, device)?.0) } else { None };
+    let scores = config.source_scores(inputs, root)?;
+    let extra = extra_rows(inputs, config, tables.as_deref(), models.as_ref(), scores, seeds, root)?;
+    Ok((extra, reports))
 }
 
 /// What every member learns from: the target's rows, and its `extra` ones.

@@ -196,8 +196,9 @@ fn member(data: &MemberData, config: &LearnerConfig) -> Result<Member> {
         (Algorithm::Bc, top) if top < 1.0 => Arc::new(best_trajectories(&data.target, top)?),
         _ => data.target.clone(),
     };
+    let others = data.extra.as_deref().filter(|_| !config.scales_by_target());
     let standardizer = match config.standardise {
-        true => even_standardizer(&target, data.extra.as_deref()),
+        true => even_standardizer(&target, others),
         false => Standardizer::identity(target.obs_dim),
     };
     let reward_scale = match config.backbone().map_or(RewardScale::None, |iql| iql.reward_scale) {

@@ -43,11 +43,12 @@ fn flat(table: &toml::Table, prefix: &str, out: &mut BTreeMap<String, String>) {
 
 /// Settings that a configuration leaves out where they have these values, because they came later than it: keys of finished runs are
 /// hashes of the text.
-const LEFT_OUT: [(&str, &str); 7] = [
+const LEFT_OUT: [(&str, &str); 8] = [
     ("learner.bc.fade", "0.0"),
     ("learner.bc.dropout", "0.0"),
     ("learner.bc.batch", "0"),
     ("learner.bc.loss", "\"squared\""),
+    ("learner.bc.scale_by", "\"all\""),
     ("filter.by", "\"zscore\""),
     ("filter.margin", "2.0"),
     ("mixture.actions", "\"own\""),
@@ -185,6 +186,14 @@ mod tests {
             (Preset::Paper, "learner.bc.batch=64", "learner.bc.batch = 64 (0)"),
         ] {
             assert_eq!(found(preset, Variant::Bc, &[set]).unwrap().1, [told]);
+        }
+        // What says how other rows are learned from is nothing to one who has none.
+        for (set, told) in [
+            ("mixture.actions=clones", "mixture.actions = \"clones\" (\"own\")"),
+            ("learner.bc.scale_by=all", "learner.bc.scale_by = \"all\" (\"target\")"),
+        ] {
+            assert_eq!(found(Preset::Default, Variant::TceOg, &[set]).unwrap().1, [told]);
+            assert_eq!(found(Preset::Default, Variant::BcEnsemble, &[set]).unwrap().1, [""; 0]);
         }
         for (set, told) in [
             ("filter.by=consistency", "filter.by = \"consistency\" (\"zscore\")"),

@@ -33,6 +33,8 @@ pub enum Variant {
     TceNoFilter,
     /// TCE(OG) without the behaviour-policy term.
     TceNoReg,
+    /// TCE(OG), cloned with the actions of clones of the target rows.
+    TceClones,
     /// A method of the registry on target and source rows, in one of its forms.
     Prior(Algorithm, Mode),
     /// IQL on target rows and rows of a model of whole target transitions (SynthER).
@@ -59,7 +61,7 @@ static ALL: LazyLock<Vec<Variant>> = LazyLock::new(|| NAMED.iter().map(|n| n.var
 /// All variants with their names: TCE and its ablations, prior methods, baselines.
 static NAMED: LazyLock<Vec<Named>> = LazyLock::new(|| {
     use Variant::*;
-    let tce = [TceOg, TceNn, TceOt, SimpleAug, TargetOnly, TargetSource, IqlSwt, TceNoFilter, TceNoReg];
+    let tce = [TceOg, TceNn, TceOt, SimpleAug, TargetOnly, TargetSource, IqlSwt, TceNoFilter, TceNoReg, TceClones];
     // BC and IQL are the learners of other variants.
     let prior = Algorithm::ALL.iter().filter(|a| !matches!(a, Algorithm::Bc | Algorithm::Iql));
     let forms = prior.flat_map(|&algorithm| {
@@ -127,6 +129,11 @@ impl Variant {
             }
             Variant::TceNoFilter => ("tce-no-filter", "TCE(OG) w/o filtering", "TCE(OG) without the z-score filter"),
             Variant::TceNoReg => ("tce-no-reg", "TCE(OG) w/o policy reg.", "TCE(OG) without the behaviour-policy term"),
+            Variant::TceClones => (
+                "tce-clones",
+                "TCE(OG), clones' actions",
+                "Clones of target and generated rows, which have the actions of clones of the target rows",
+            ),
             Variant::Prior(algorithm, _) => {
                 let about = algorithm.about();
                 (about.name, about.title, about.description)
@@ -160,7 +167,10 @@ impl Variant {
         let own = |generated: &str| generated == "tce" || self == Variant::BcEnsemble;
         let rows = |generated: &str, source: &str, lambda: f64| {
             let all = if own(generated) { "" } else { "target.trajectories = \"all\"\n" };
-            format!("mixture = {{ generated = {generated:?}, source = {source:?}, lambda = {lambda:?} }}\n{all}")
+            // Dotted keys, so that a variant can add to the table.
+            format!(
+                "mixture.generated = {generated:?}\nmixture.source = {source:?}\nmixture.lambda = {lambda:?}\n{all}"
+            )
         };
         // IQL without TCE's regulariser.
         let iql = |generated: &str, source: &str, lambda: f64| {
@@ -200,6 +210,9 @@ impl Variant {
             Variant::IqlSwt => iql("none", "relabelled", 1.0),
             Variant::TceNoFilter => rows("tce", "none", 0.0) + "filter.enabled = false\n",
             Variant::TceNoReg => iql("tce", "none", 0.0),
+            Variant::TceClones => {
+                rows("tce", "none", 0.0) + "mixture.actions = \"clones\"\nlearner.algorithm = \"bc\"\n"
+            }
             Variant::Prior(algorithm, mode) => prior(algorithm, mode),
             Variant::Synther => iql("synther", "none", 0.0),
             Variant::BcRaw => bc(1, "learner.standardise = false\n"),

@@ -11,6 +11,7 @@
 //! | E | `ensemble` | 1 | own: policies whose outputs are averaged before the tanh |
 //! | - | `mixed_steps` | 0 | own: generated rows are fitted sooner than they are right, see below |
 //! | - | `fade` | 0 | own: other rows first, the target's alone at last, see below |
+//! | - | `scale_by` | all | own: whose spread standardises observations, see [`ScaleBy`] |
 //! | `top` | [`crate::best_trajectories`], before the buffer is made | 1 | "BC-10 %" of Chen et al. 2021 |
 //!
 //! A network that fits 5000 actions exactly says little between them. Where the rows lie close to each other this is
@@ -134,6 +135,9 @@ pub struct BcConfig {
     /// What a clone of an action costs.
     #[serde(skip_serializing_if = "CloneLoss::is_squared")]
     pub loss: CloneLoss,
+    /// Whose rows give the mean and the spread by which observations are standardised, where others are cloned, too.
+    #[serde(skip_serializing_if = "ScaleBy::is_all")]
+    pub scale_by: ScaleBy,
 }
 
 impl Default for BcConfig {
@@ -146,6 +150,7 @@ impl Default for BcConfig {
             fade: 0.0,
             batch: 0,
             loss: CloneLoss::Squared,
+            scale_by: ScaleBy::All,
         }
     }
 }
@@ -167,6 +172,24 @@ pub enum CloneLoss {
     Squared,
     /// The likelihood under a tanh-Gaussian policy, whose spread is learned: noisy actions count less.
     Likelihood,
+}
+
+/// Whose rows give the mean and the spread of observations.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ScaleBy {
+    /// All rows that are cloned, the target's as much as the others.
+    #[default]
+    All,
+    /// The target's. Clones of generated rows then see the target's states as sharply as clones of the target's rows alone do.
+    Target,
+}
+
+impl ScaleBy {
+    // The cache keys of runs from before this key was added do not contain it.
+    fn is_all(&self) -> bool {
+        *self == Self::All
+    }
 }
 
 impl CloneLoss {

@@ -216,15 +216,12 @@ impl Manifest {
             lacking.iter().filter(|(_, why)| why.is_some()).map(|((task, _), _)| *task).collect();
         let mut plan = Self { header, entries: Vec::new() };
         let mut known = BTreeMap::new();
-        let (mut verdicts, mut by_clones) = (Verdicts::default(), BTreeSet::new());
+        let mut verdicts = Verdicts::default();
         for (part, own) in parts.iter().zip(&runs) {
             for (task, variant, label, config) in own.iter().filter(|r| !without.contains(&r.0)) {
                 for seed in part.seeds.clone() {
                     let run = plan.add_run(&mut known, &part.name, (*task, *variant, label), config, seed);
                     verdicts.add((*task, seed), run);
-                    if config.mixture.by_clones() {
-                        by_clones.insert(run);
-                    }
                 }
             }
             if description.verdicts {
@@ -243,19 +240,21 @@ impl Manifest {
             let (are, their) = if without.len() == 1 { ("task is", "its") } else { ("tasks are", "their") };
             tce_base::note!("{} {are} left out, because {their} data cannot be had ({tasks}):\n{list}", without.len());
         }
-        plan.clones_before(&by_clones);
-        Ok(plan.sorted())
+        Ok(plan.with_clones_first().sorted())
     }
 
-    /// Runs whose rows get the actions of clones, `by_clones`, come behind the run of these clones, where the sweep has one.
-    fn clones_before(&mut self, by_clones: &BTreeSet<usize>) {
+    /// Runs whose other rows get the actions of clones need the run of these clones, where the sweep has one.
+    fn with_clones_first(mut self) -> Self {
+        let by_clones = |text: &str| toml::from_str::<Config>(text).is_ok_and(|config| config.mixture.by_clones());
+        let configs = self.header.configs.iter().filter(|(_, text)| by_clones(text)).map(|(hash, _)| hash);
+        let configs: BTreeSet<&String> = configs.collect();
         let clones = |e: &Entry| e.variant == Some(Variant::BcEnsemble) && e.label.is_empty();
         let runs: BTreeMap<(Task, u64), usize> =
             self.entries.iter().enumerate().filter(|(_, e)| clones(e)).map(|(i, e)| ((e.task, e.seed), i)).collect();
-        for &run in by_clones {
-            let Entry { task, seed, needs, .. } = &mut self.entries[run];
-            needs.extend(runs.get(&(*task, *seed)));
+        for run in self.entries.iter_mut().filter(|e| e.kind == Kind::Run && configs.contains(&e.config)) {
+            run.needs.extend(runs.get(&(run.task, run.seed)));
         }
+        self
     }
 
     /// The place of `entry`, which is added unless it is there.

@@ -46,6 +46,12 @@ fn the_same_seed_gives_the_same_bytes_at_any_thread_count() {
     let before = times();
     assert_eq!(scores(&run("one", "2")), scores(&first));
     assert_eq!(times(), before);
+    fs::rename(dir.path().join("two"), dir.path().join("moved")).unwrap();
+    let moved = run("moved", "2")["rows"].clone();
+    assert!(
+        moved.as_array().unwrap().iter().all(|r| r["directory"].as_str().unwrap().starts_with("moved/")),
+        "{moved}"
+    );
 
     // A result that was tampered with is noticed.
     let policy = a.iter().find(|(p, _)| p.to_string_lossy().contains("policy-seed0")).unwrap();
