@@ -42,7 +42,7 @@ pub struct Summary {
     pub extra_rows: usize,
     /// The generated rows, per member; empty if there are none.
     pub generated: Vec<Generated>,
-    /// How far the actions of clones are from the own ones of the rows that have them, per member ([`take_actions`]); empty if none have.
+    /// How far the actions of clones are from the own ones of the rows that have them, per member: the root mean square; empty if none have.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub action_distances: Vec<f64>,
     /// Seconds from data to scores, without stages that were finished before. Interrupted attempts count up to their last checkpoint.
