@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
-use tce_base::write_json;
+use tce_base::{create_folder, write_json};
 
 /// What the names of these files end with, where they lie beside checkpoints.
 pub(crate) const SUFFIX: &str = "seconds";
@@ -84,7 +84,7 @@ impl Clock {
     /// Starts the clock of the work whose seconds are noted at `path`, and whose checkpoints lie beside that file.
     pub fn start(path: PathBuf) -> Self {
         if let Some(folder) = path.parent() {
-            let _ = fs::create_dir_all(folder);
+            let _ = create_folder(folder);
         }
         let noted = noted(&path);
         let more = noted.map_or(0.0, |noted| since_note(&path, noted.at));

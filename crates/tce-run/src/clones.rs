@@ -11,7 +11,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use tce_base::{Progress, interrupted};
 use tce_data::Transitions;
-use tce_learn::Policy;
+use tce_learn::{Policy, rmse};
 
 use crate::error::{Error, Result};
 use crate::policy_training::MemberData;
@@ -36,12 +36,6 @@ fn actions_of(policy: &Policy, rows: &Transitions, label: String) -> Result<Vec<
     Ok(actions)
 }
 
-/// Root mean square of the differences.
-fn distance(a: &[f32], b: &[f32]) -> f64 {
-    let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-    (sum / a.len().max(1) as f64).sqrt()
-}
-
 /// Gives the other rows of every member the actions of its policy in `policies`. Returns how far these are from the rows' own: the root mean
 /// square over rows and actions, per member.
 ///
@@ -54,7 +48,7 @@ pub fn take_actions(data: &mut [MemberData], policies: &[PathBuf]) -> Result<Vec
         // Rows are in the box, whatever the units of the user's actions are.
         let policy = Policy::load(file)?.in_units(None);
         let actions = actions_of(&policy, rows, format!("actions of clones [{}]", member.seed))?;
-        let differ = distance(&actions, &rows.actions);
+        let differ = rmse(&actions, &rows.actions);
         tce_base::note!(
             "seed {}: other rows have the actions of clones of the target rows, which are {differ:.3} (root mean square) from their own",
             member.seed

@@ -216,7 +216,12 @@ impl MixtureConfig {
 
     /// Whether clones of the target rows are learned first, for the actions of other rows.
     pub fn by_clones(&self) -> bool {
-        self.actions == RowActions::Clones && self.learned_rows() == LearnedRows::Mixed
+        self.by_clones_on(self.learned_rows())
+    }
+
+    /// The same for a training on these rows, which are the user's own.
+    pub fn by_clones_on(&self, rows: LearnedRows) -> bool {
+        self.actions == RowActions::Clones && rows == LearnedRows::Mixed
     }
 
     /// Whether rows besides the target's are learned from.
@@ -269,7 +274,7 @@ impl Config {
     /// Names the setting.
     pub fn ensure_actions(&self, rows: LearnedRows) -> Result<()> {
         let algorithm = self.learner.algorithm;
-        if rows == LearnedRows::Target || self.mixture.actions == RowActions::Own || algorithm == Algorithm::Bc {
+        if !self.mixture.by_clones_on(rows) || algorithm == Algorithm::Bc {
             return Ok(());
         }
         Err(Error::Usage(format!(

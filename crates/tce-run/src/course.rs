@@ -98,7 +98,7 @@ impl<'a> Course<'a> {
         // As in the costs of earlier commands.
         let mixed = rows == LearnedRows::Mixed;
         let learner = &config.learner;
-        let mut of = learner.used();
+        let mut of = learner.used(rows);
         of["steps"] = Value::Null;
         let step = self.step(&training_step(name), json!([of, mixed, config.evaluation.episodes]));
         step.size = learner.steps(rows) as f64;

@@ -183,7 +183,7 @@ impl LearnerConfig {
     }
 
     /// The keys that the algorithm looks at: what a run's identity depends on.
-    pub fn used(&self) -> serde_json::Value {
+    pub fn used(&self, rows: LearnedRows) -> serde_json::Value {
         let Self { algorithm, steps, batch, standardise, .. } = self;
         let mut used = serde_json::json!({
             "algorithm": algorithm, "steps": steps, "batch": batch, "standardise": standardise,
@@ -191,22 +191,16 @@ impl LearnerConfig {
         used[algorithm.about().table] = self.table(*algorithm);
         if *algorithm == Algorithm::Bc {
             used["top"] = serde_json::json!(self.top);
+            if let (LearnedRows::Target, Some(table)) = (rows, used["bc"].as_object_mut()) {
+                // There is one table to scale by.
+                table.remove("scale_by");
+            }
         }
         if let Some(iql) = self.backbone() {
             if iql.regulariser != RegulariserKind::None {
                 used["behaviour"] = serde_json::json!(self.behaviour());
             }
             used["iql"] = serde_json::json!(iql);
-        }
-        used
-    }
-
-    /// [`Self::used`] for a training on these rows.
-    pub fn used_on(&self, rows: LearnedRows) -> serde_json::Value {
-        let mut used = self.used();
-        if let (LearnedRows::Target, Some(table)) = (rows, used["bc"].as_object_mut()) {
-            // There is one table to scale by.
-            table.remove("scale_by");
         }
         used
     }

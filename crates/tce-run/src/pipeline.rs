@@ -89,7 +89,7 @@ impl<'a> RunSpec<'a> {
             inputs: inputs.spec_imitated(Domains::with_source(config.needs_source()), &config.target),
             seeds,
             mixture: config.mixture.used(),
-            learner: config.learner.used_on(config.mixture.learned_rows()),
+            learner: config.learner.used(config.mixture.learned_rows()),
             evaluation: &config.evaluation,
             generator: config.uses("generator").then_some(&config.generator),
             filter: config.uses("filter").then_some(&config.filter),
@@ -108,7 +108,6 @@ impl Config {
         let two_stages = self.mixture.generated == GeneratedRows::Tce;
         let mixed = self.mixture.learned_rows() == LearnedRows::Mixed;
         match section {
-            _ if ["mixture.actions", "learner.bc.scale_by"].contains(&key) && !mixed => false,
             "generator" | "filter" => two_stages,
             "labels" => two_stages || self.mixture.source == SourceRows::Relabelled,
             "dynamics" => two_stages && self.filter.by_dynamics(),
@@ -116,7 +115,11 @@ impl Config {
                 let used = used_of_single_stage(&self.single_stage, self.mixture.generated, self.learner.algorithm);
                 used.is_some_and(|used| used.get(table).is_some())
             }
-            "learner" => self.learner.used().get(table).is_some(),
+            "mixture" => mixed || table != "actions",
+            "learner" => {
+                let used = self.learner.used(self.mixture.learned_rows()).get(table).is_some();
+                used && (mixed || key != "learner.bc.scale_by")
+            }
             "source" => self.needs_source(),
             // Verdicts on files of one's own alone.
             "fitted_q" => false,
@@ -203,19 +206,24 @@ pub fn run(
     write_atomically(&attempt.file("config.toml"), config.to_toml().as_bytes())?;
     let mut files = vec!["config.toml".to_owned()];
 
-    let clones = clones(inputs, config, seeds, root, place, device)?;
+    // The policies whose actions other rows get: the baseline, a run of its own beside this one.
+    let clones = match config.mixture.by_clones() {
+        true => run(Variant::BcEnsemble.name(), inputs, &config.of_clones(), seeds, root, place, device)?.policies(),
+        false => Vec::new(),
+    };
     let (extra, reports) = other_rows(inputs, config, seeds, root, &attempt, &mut files, device)?;
     if let Some(choice) = inputs.choice(&config.target) {
         tce_base::note!("{name}: {}", choice.reason);
     }
     let mut data = members(inputs, config, extra.as_deref(), seeds)?;
+    let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
+    // So that actions are replaced in place where no other member has the rows.
+    drop(extra);
     let action_distances = take_actions(&mut data, &clones)?;
     let arena = match (inputs.agent, inputs.shift) {
         (Some(agent), Some(shift)) => Some(Arena::new(agent, shift, config.evaluation.scores)),
         _ => None,
     };
-    let extra_count = extra.as_ref().map_or(0, |e| e[0].rows.len());
-    drop(extra);
     let place = (attempt.directory(), attempt.key());
     tce_base::begin_step(&crate::course::training_step(name));
     // The end of the attempt removes what the training leaves.
@@ -246,24 +254,6 @@ pub fn run(
     files.push(result);
     attempt.finish(&files, &summary)?;
     Ok(summary)
-}
-
-/// The policies whose actions other rows get, one per seed: clones of the target rows, which are a run of their own beside this one. None
-/// where rows keep their actions.
-fn clones(
-    inputs: &Inputs,
-    config: &Config,
-    seeds: &[u64],
-    root: &Path,
-    place: &str,
-    device: &Device,
-) -> Result<Vec<PathBuf>> {
-    match config.mixture.by_clones() {
-        false => Ok(Vec::new()),
-        true => {
-            Ok(run(Variant::BcEnsemble.name(), inputs, &config.of_clones(), seeds, root, place, device)?.policies())
-        }
-    }
 }
 
 /// The rows besides the target's, per member; None for target rows alone. And what there is to tell of generated ones: their files are linked

@@ -23,7 +23,7 @@ use tce_nn::Device;
 use tce_zoo::actors::Arena;
 
 use crate::clones::take_actions;
-use crate::config::{Algorithm, Config, LearnerConfig, RowActions};
+use crate::config::{Algorithm, Config, LearnerConfig};
 use crate::course::{Course, training_step};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
@@ -286,7 +286,7 @@ impl TrainingRun<'_> {
 
     /// Whether the baseline is trained first, because the extra rows get its actions.
     fn clones_first(&self, inputs: &Inputs) -> bool {
-        inputs.extra.is_some() && self.config.mixture.actions == RowActions::Clones
+        self.config.mixture.by_clones_on(LearnedRows::with(inputs.extra.as_ref()))
     }
 
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {

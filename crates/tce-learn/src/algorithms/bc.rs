@@ -119,24 +119,24 @@ pub struct BcConfig {
     pub ensemble: usize,
     /// Share of hidden units that are left out of each update, at random. "auto": 0.3 where it lowers a clone's error at rows that it has
     /// not seen, else none.
-    #[serde(skip_serializing_if = "is_zero")]
+    #[serde(skip_serializing_if = "is_default")]
     pub dropout: OrAuto<f64>,
     /// Most steps where rows besides the target's are cloned, too: generated rows are fitted sooner than they are right. 0: as many
     /// as without them.
     pub mixed_steps: u64,
     /// Share of the steps after which only target rows are cloned. The other rows' share of a batch falls linearly until then. 0: half of
     /// every batch, to the end.
-    #[serde(skip_serializing_if = "is_zero")]
+    #[serde(skip_serializing_if = "is_default")]
     #[schemars(range(min = 0.0, max = 1.0))]
     pub fade: f64,
     /// Rows of each update. 0: `learner.batch`.
-    #[serde(skip_serializing_if = "is_zero")]
+    #[serde(skip_serializing_if = "is_default")]
     pub batch: usize,
     /// What a clone of an action costs.
-    #[serde(skip_serializing_if = "CloneLoss::is_squared")]
+    #[serde(skip_serializing_if = "is_default")]
     pub loss: CloneLoss,
     /// Whose rows give the mean and the spread by which observations are standardised, where others are cloned, too.
-    #[serde(skip_serializing_if = "ScaleBy::is_all")]
+    #[serde(skip_serializing_if = "is_default")]
     pub scale_by: ScaleBy,
 }
 
@@ -156,7 +156,7 @@ impl Default for BcConfig {
 }
 
 // The cache keys of runs from before a key was added do not contain it.
-fn is_zero<T: Default + PartialEq>(value: &T) -> bool {
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
@@ -183,20 +183,6 @@ pub enum ScaleBy {
     All,
     /// The target's. Clones of generated rows then see the target's states as sharply as clones of the target's rows alone do.
     Target,
-}
-
-impl ScaleBy {
-    // The cache keys of runs from before this key was added do not contain it.
-    fn is_all(&self) -> bool {
-        *self == Self::All
-    }
-}
-
-impl CloneLoss {
-    // The cache keys of runs from before this key was added do not contain it.
-    fn is_squared(&self) -> bool {
-        *self == Self::Squared
-    }
 }
 
 /// Behaviour cloning of a population.

@@ -7,8 +7,8 @@ use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 use tce_data::Transitions;
 use tce_learn::{
-    About, Bc, BcConfig, Built, LearnError, Learner, Meter, Method, Minibatch, OtherRows, Policy, PolicyLearner,
-    RowScores, Setup,
+    About, Bc, BcConfig, Built, LearnError, LearnedRows, Learner, Meter, Method, Minibatch, OtherRows, Policy,
+    PolicyLearner, RowScores, Setup,
 };
 use tce_nn::{NamedParameters, NetworkError};
 
@@ -114,9 +114,9 @@ fn a_line_makes_it_known_everywhere() {
         ("One step of so many is done.", Some("1 to 10"))
     );
     // In the keys of runs: its own keys alone, and only where it is the one that learns.
-    let used = own.used();
+    let used = own.used(LearnedRows::Mixed);
     assert_eq!((&used["toy"]["stride"], used.get("iql"), used.get("bc")), (&3.into(), None, None));
-    assert!(config(&["learner.algorithm=bc"]).unwrap().used().get("toy").is_none());
+    assert!(config(&["learner.algorithm=bc"]).unwrap().used(LearnedRows::Mixed).get("toy").is_none());
     // A sweep that was planned before knows nothing of it.
     let mut before = toml::Value::try_from(&own).unwrap();
     before.as_table_mut().unwrap().remove("toy");

@@ -12,7 +12,7 @@ use std::process::Command;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
-use tce_base::{Owner, sha256_hex, write_atomically};
+use tce_base::{Owner, create_folder, sha256_hex, write_atomically};
 
 use super::{Kind, Sweep};
 use crate::device_kind::DeviceKind;
@@ -170,8 +170,7 @@ impl Sweep {
                     true => None,
                     false => {
                         elements.iter().flatten().for_each(|&index| self.forget_failure(&self.entries()[index]));
-                        fs::create_dir_all(directory.join("logs"))
-                            .map_err(|e| tce_base::FileError::new(&directory, "create a directory in", e))?;
+                        create_folder(&directory.join("logs"))?;
                         let lines = elements.iter().fold(String::new(), |mut text, indices| {
                             let words: Vec<_> = indices.iter().map(ToString::to_string).collect();
                             let _ = writeln!(text, "{}", words.join(" "));
