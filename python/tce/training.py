@@ -35,6 +35,8 @@ class TrainingRun:
     ----------
     policies : list of Policy
         One per seed.
+    other_policies : list of Policy
+        Those that learned from the extra rows with the baseline's actions, one per seed; empty where none were asked for.
     policy : Policy
         The recommended one; the only one if none was recommended.
     verdict : dict or None
@@ -51,6 +53,8 @@ class TrainingRun:
         self.out = out
         self._keep = keep
         self.policies = [Policy.load(out / Path(file).name) for file in summary["policies"]]
+        others = [Path(file) for file in summary.get("other_policies", [])]
+        self.other_policies = [Policy.load(out / file.parent.name / file.name) for file in others]
         self.verdict: dict[str, Any] | None = summary.get("verdict")
 
     @cached_property
@@ -97,6 +101,7 @@ def train(
     *,
     learner: str | None = None,
     top: float | None = None,
+    actions: str | None = None,
     seeds: int = 1,
     seed: int = 0,
     compare: bool = True,
@@ -126,6 +131,9 @@ def train(
         By default clones (``"bc"``); ``tce learn --list`` tells all.
     top : float in (0, 1], optional
         ``bc``: the share of the best trajectories that is cloned.
+    actions : {"own", "clones", "both"}, optional
+        ``bc`` with extra rows: which actions these are cloned with, their own or those of clones of the target rows in the same states. By
+        default both are tried and compared, unless the setting `mixture.actions` is "clones".
     seeds, seed : int
         How many policies, and the first seed.
     compare : bool
@@ -164,7 +172,7 @@ def train(
     )
     keep = tempfile.TemporaryDirectory(prefix="tce-") if out is None else None
     folder = Path(out if out is not None else keep.name)  # type: ignore[union-attr]
-    wanted = {"learner": learner, "top": top, "seeds": seeds, "first_seed": seed, "compare": compare}
+    wanted = {"learner": learner, "top": top, "seeds": seeds, "first_seed": seed, "compare": compare, "actions": actions}
     bars, call = chosen(progress)
     reader = MetricsReader(folder / "metrics.jsonl", callback)
     attended = (bars, call if callback is None else reader.beside(call))

@@ -59,7 +59,14 @@ def test_policies_are_those_of_the_command_line(source, target, wider, tmp_path)
     tce_command("learn", *files, "--out", "command", "--seeds", "2", *sets(), cwd=tmp_path)
     for name in ("policy-seed0.safetensors", "policy-seed1.safetensors", "policy.safetensors"):
         assert (tmp_path / "python" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
-    assert run.verdict["method"] in ("bc with the extra rows", "cloning the target rows")
+    names = ["cloning the target rows", "bc with the extra rows", "bc with the extra rows, clones' actions"]
+    assert [tried["name"] for tried in run.verdict["tried"]] == names and run.verdict["method"] in names
+    other = [f"clones-actions/policy-seed{seed}.safetensors" for seed in (0, 1)]
+    assert run.summary["other_policies"] == [str(tmp_path / "python" / name) for name in other]
+    assert [(tmp_path / "python" / name).read_bytes() for name in other] == [
+        (tmp_path / "command" / name).read_bytes() for name in other
+    ]
+    assert len(run.other_policies) == 2
     assert len(run.policies) == 2 and run.policy(target["observations"]).shape == (300, 2)
     # Once more: from the folder, without training.
     assert tce.train(target, wider, config=TINY, out=tmp_path / "python", seeds=2).summary == run.summary
@@ -94,6 +101,8 @@ def test_a_temporary_folder_goes_with_the_result(target):
         (dict(learner="iqll"), "did you mean `iql`"),
         (dict(learner="dara"), "extra="),
         (dict(seeds=0), "at least 1"),
+        (dict(actions="mine"), 'found "mine", expected one of own, clones, both'),
+        (dict(actions="own"), "found target rows alone"),
         (dict(env="hoper-morph"), "hopper"),
         (dict(config={"learner.steps": object()}), "found object"),
     ],

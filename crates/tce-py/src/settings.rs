@@ -20,7 +20,7 @@ pub struct Settings {
 }
 
 /// One of an enumeration of the command line by its name.
-fn named<T: clap::ValueEnum>(what: &str, name: &str) -> Result<T> {
+pub fn named<T: clap::ValueEnum>(what: &str, name: &str) -> Result<T> {
     T::from_str(name, false).map_err(|_| {
         let all: Vec<String> =
             T::value_variants().iter().filter_map(|v| Some(v.to_possible_value()?.get_name().to_owned())).collect();

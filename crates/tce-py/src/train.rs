@@ -9,7 +9,7 @@ use tce_run::pipeline::seeds as counted;
 use tce_run::training_run::{Comparison, TrainingRun, ensure_fits};
 
 use crate::errors::Raise;
-use crate::settings::{Robot, Settings};
+use crate::settings::{Robot, Settings, named};
 use crate::table::Table;
 use crate::work::{Progress, attended};
 
@@ -22,6 +22,7 @@ pub struct Wanted {
     seeds: usize,
     first_seed: u64,
     compare: bool,
+    actions: Option<String>,
 }
 
 /// Target, extra and source rows.
@@ -40,11 +41,13 @@ pub fn train(
     progress: Progress,
 ) -> PyResult<String> {
     let (target, extra, source) = tables;
-    let config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
+    let mut config = settings.for_training(wanted.learner.as_deref(), wanted.top).or_raise(py)?;
     let (own, device) = (robot.own().or_raise(py)?, settings.device().or_raise(py)?);
     let seeds = counted(wanted.first_seed, wanted.seeds).or_raise(py)?;
-    ensure_fits(&config, LearnedRows::with(extra.as_ref())).or_raise(py)?;
-    let comparison = if wanted.compare { Comparison::Recommend } else { Comparison::Skip };
+    let rows = LearnedRows::with(extra.as_ref());
+    let actions = wanted.actions.as_deref().map(|name| named("actions", name)).transpose().or_raise(py)?;
+    let comparison = Comparison::choose(&mut config, actions, rows, wanted.compare).or_raise(py)?;
+    ensure_fits(&config, rows).or_raise(py)?;
     let target = target.rows.clone();
     let source = source.filter(|_| wanted.compare).map(|table| table.rows.clone());
     let extra = extra.map(|table| (table.rows.clone(), table.origin().map(<[f32]>::to_vec)));

@@ -183,6 +183,14 @@ impl RowActions {
     fn is_own(&self) -> bool {
         *self == Self::Own
     }
+
+    /// The others of the two.
+    pub fn other(self) -> Self {
+        match self {
+            Self::Own => Self::Clones,
+            Self::Clones => Self::Own,
+        }
+    }
 }
 
 /// The data the policy is learned from.
@@ -208,10 +216,14 @@ impl MixtureConfig {
         Self { generated: GeneratedRows::None, source: SourceRows::None, lambda: 0.0, actions: RowActions::Own }
     }
 
+    /// The same with these actions.
+    pub fn with_actions(&self, actions: RowActions) -> Self {
+        Self { actions, ..self.clone() }
+    }
+
     /// What a run depends on: target rows keep their actions.
     pub fn used(&self) -> Self {
-        let actions = if self.by_clones() { RowActions::Clones } else { RowActions::Own };
-        Self { actions, ..self.clone() }
+        self.with_actions(if self.by_clones() { RowActions::Clones } else { RowActions::Own })
     }
 
     /// Whether clones of the target rows are learned first, for the actions of other rows.

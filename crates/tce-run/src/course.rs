@@ -93,15 +93,17 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// The training of a policy on `rows`, by its name in [`training_step`].
+    /// The training of a policy on `rows`, by its name in [`training_step`]; what an earlier method of the command has trained is there
+    /// already.
     pub fn training(&mut self, name: &str, config: &Config, rows: LearnedRows) {
         // As in the costs of earlier commands.
         let mixed = rows == LearnedRows::Mixed;
         let learner = &config.learner;
         let mut of = learner.used(rows);
         of["steps"] = Value::Null;
+        let trained = self.steps.iter().any(|step| step.name == training_step(name));
         let step = self.step(&training_step(name), json!([of, mixed, config.evaluation.episodes]));
-        step.size = learner.steps(rows) as f64;
+        step.size = if trained { 0.0 } else { learner.steps(rows) as f64 };
         // The other learners train something else before, with bars of its own.
         step.last_bar = (learner.algorithm == Algorithm::Bc).then_some("learn ");
         // The cost depends on the settings, not on the name.
@@ -111,11 +113,10 @@ impl<'a> Course<'a> {
         }
     }
 
-    /// The clones whose actions other rows get, where `config` says so; those that an earlier method of the command is are there already.
+    /// The clones whose actions other rows get, where `config` says so.
     pub fn clones(&mut self, config: &Config) {
-        let name = Variant::BcEnsemble.name();
-        if config.mixture.by_clones() && !self.steps.iter().any(|step| step.name == training_step(name)) {
-            self.training(name, &config.of_clones(), LearnedRows::Target);
+        if config.mixture.by_clones() {
+            self.training(Variant::BcEnsemble.name(), &config.of_clones(), LearnedRows::Target);
         }
     }
 
@@ -148,9 +149,10 @@ mod tests {
     fn what_an_earlier_method_has_made_costs_nothing() {
         let device = tce_nn::cpu();
         let mut course = Course::new("hopper", 1, &device, Path::new("runs"));
-        for variant in [Variant::Bc, Variant::TceOg, Variant::TceNn] {
+        for variant in [Variant::Bc, Variant::TceOg, Variant::TceNn, Variant::SourceClones, Variant::BcEnsemble] {
             let config = Layered::new(Preset::Quick, None, Some(variant), None, &[]).unwrap().config().unwrap();
             course.generating(&config);
+            course.clones(&config);
             course.training(variant.name(), &config, config.mixture.learned_rows());
         }
         let steps: Vec<_> = course.steps.iter().map(|s| (s.name.as_str(), s.size)).collect();
@@ -164,6 +166,9 @@ mod tests {
             ("score networks", 0.0),
             ("generated rows", 0.0),
             ("learn tce-nn", 12_000.0),
+            ("learn bc-ensemble", 12_000.0),
+            ("learn source-clones", 12_000.0),
+            ("learn bc-ensemble", 0.0),
         ];
         assert_eq!(steps, expected);
     }

@@ -6,8 +6,9 @@
 //! | `policy.safetensors` | the recommended one |
 //! | `verdict.json` | why it is recommended |
 //! | `baseline/` | the clones of the target rows, where the policies learned from more than those |
+//! | `clones-actions/`, `own-actions/` | policies that learned from the same rows with other actions ([`Comparison::Recommend`]) |
 //! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | metrics, settings, inputs of the key, results |
-//! | `learned.json` | that a training came to its end, here and in `baseline/` |
+//! | `learned.json` | that a training came to its end, here and in the folders |
 //!
 //! A second call with the same directory returns the finished run, or does what is missing or was changed: finished trainings are not done
 //! again, others go on from their checkpoints. Paths in files are relative to the directory, which can be moved.
@@ -17,13 +18,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use tce_base::{first_damaged, read_if_there, read_json, sha256_files, sha256_hex, write_json};
-use tce_data::{ScoreTable, Transitions};
+use tce_data::ScoreTable;
 use tce_learn::{LearnedRows, OtherRows, Policy};
 use tce_nn::Device;
 use tce_zoo::actors::Arena;
 
 use crate::clones::take_actions;
-use crate::config::{Algorithm, Config, LearnerConfig};
+use crate::config::{Algorithm, Config, LearnerConfig, RowActions};
 use crate::course::{Course, training_step};
 use crate::device_kind::DeviceKind;
 use crate::error::{Error, Result};
@@ -32,7 +33,13 @@ use crate::methods::row_scores;
 use crate::off_policy_evaluation::OffPolicyEvaluator;
 use crate::own::Own;
 use crate::policy_training::{Learned, MemberData, learn, policy_file, save_policies};
-use crate::verdict::{Candidate, Kept, Verdict, keep, only, recommend};
+use crate::verdict::{Candidate, Kept, keep, only, recommend};
+
+mod comparison;
+mod unrewarded;
+
+pub use comparison::{Comparison, TriedActions};
+use unrewarded::{only_reward, without_rewards};
 
 /// The name of the baseline: clones of the target rows alone.
 const BASELINE: &str = "cloning the target rows";
@@ -42,15 +49,6 @@ const BASELINE_FOLDER: &str = "baseline";
 const CONFIG: &str = "config.toml";
 /// The file of all inputs that decide the result; the first one of a run.
 const SPEC: &str = "spec.json";
-
-/// Whether the policies are compared, with each other and with a baseline.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Comparison {
-    /// Learn a baseline from the target rows alone, try all policies in learned dynamics, and recommend one.
-    Recommend,
-    /// Only train the policies.
-    Skip,
-}
 
 /// The inputs of a training run besides its tables.
 #[derive(Clone, Debug)]
@@ -77,6 +75,9 @@ pub struct Trained {
     /// Training and evaluation.
     #[serde(flatten)]
     pub learned: Learned,
+    /// The policies that learned from the extra rows with other actions, one per seed; none where none were asked for.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub other_policies: Vec<PathBuf>,
     /// The recommendation, and the file `policy.safetensors` with the policy.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub verdict: Option<Kept>,
@@ -85,7 +86,7 @@ pub struct Trained {
 impl Trained {
     /// The same with other paths.
     fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> Self {
-        self.policies.iter_mut().for_each(|p| *p = path(p));
+        self.policies.iter_mut().chain(&mut self.other_policies).for_each(|p| *p = path(p));
         if let Some(kept) = &mut self.verdict {
             kept.file = path(&kept.file);
             kept.verdict.policy = path(&kept.verdict.policy);
@@ -162,6 +163,20 @@ pub fn ensure_fits(config: &Config, rows: LearnedRows) -> Result<()> {
     config.ensure_actions(rows)
 }
 
+/// What policies are learned by.
+struct Method {
+    /// The name in the comparison.
+    name: String,
+    /// The name in messages.
+    step: String,
+    /// Whether the extra rows have the actions of the baseline.
+    by_clones: bool,
+    /// The hash of all inputs.
+    key: String,
+    /// The place of its files.
+    directory: PathBuf,
+}
+
 /// One of the trainings of a run.
 struct Training<'a> {
     /// What it is called in messages.
@@ -182,49 +197,90 @@ impl TrainingRun<'_> {
     /// If the learner needs other rows than there are, the directory holds another run, training fails, or the user interrupts.
     pub fn run(&self, inputs: &Inputs, device: &Device) -> Result<Trained> {
         ensure_own_folder(self.out)?;
-        ensure_fits(self.config, LearnedRows::with(inputs.extra.as_ref()))?;
+        let rows = LearnedRows::with(inputs.extra.as_ref());
+        ensure_fits(self.config, rows)?;
+        if self.comparison.both() {
+            ensure_fits(&self.other(), rows)?;
+        }
         inputs.ensure_episodes(&self.config.learner)?;
         let (out, seeds) = (self.out, self.seeds);
-        let method = self.config.learner.algorithm.about();
         let spec = self.spec(inputs, device);
-        let key = sha256_hex(without_source(&spec).to_string().as_bytes());
+        let key = key_of(&spec);
         if let Some(trained) = self.found(&spec, &key)? {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
         }
-        let mut data = self.members(inputs)?;
-        let arena = self.own.env.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
+        let data = self.members(inputs)?;
         write_json(&out.join(SPEC), &spec)?;
         tce_base::write_atomically(&out.join(CONFIG), self.config.to_toml().as_bytes())?;
         self.plan(inputs, device);
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect::<Vec<_>>();
-        let first =
-            self.clones_first(inputs).then(|| self.baseline(alone.clone(), &key, inputs, device)).transpose()?;
-        if let Some(clones) = &first {
-            take_actions(&mut data, &clones.files)?;
+        let mut baseline = None;
+        let mut candidates = Vec::new();
+        let mut learned = None;
+        for method in self.methods(inputs, device) {
+            let mut data = data.clone();
+            if method.by_clones {
+                if baseline.is_none() {
+                    baseline = Some(self.baseline(alone.clone(), &key, inputs, device)?);
+                }
+                take_actions(&mut data, baseline.as_ref().map_or(&[], |clones| &clones.files))?;
+            }
+            // The first one's policies are the training's own, and tried in a simulator where there is one.
+            let arena = self.own.env.filter(|_| learned.is_none());
+            let arena = arena.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
+            let (name, directory) = (&method.step, &method.directory);
+            let training = Training { name, data, learner: &self.config.learner, arena, directory };
+            let (files, result) = self.train(training, &method.key, inputs, device)?;
+            learned.get_or_insert(result);
+            candidates.push(Candidate { name: method.name, baseline: inputs.extra.is_none(), files });
         }
-        let training = Training { name: method.name, data, learner: &self.config.learner, arena, directory: out };
-        let (policies, learned) = self.train(training, &key, inputs, device)?;
+        let mut files = candidates.iter().map(|candidate| candidate.files.clone());
+        let (policies, other_policies) = (files.next().unwrap_or_default(), files.next().unwrap_or_default());
         let verdict = match self.comparison {
             Comparison::Skip => None,
-            Comparison::Recommend => {
-                let alone_is_baseline = inputs.extra.is_none();
-                let name = match alone_is_baseline {
-                    true => method.name.to_owned(),
-                    false => format!("{} with the extra rows", method.name),
-                };
-                let own = Candidate { name, baseline: alone_is_baseline, files: policies.clone() };
-                let baseline = match first {
-                    None if !alone_is_baseline => Some(self.baseline(alone, &key, inputs, device)?),
-                    first => first,
-                };
-                Some(self.recommend(baseline.into_iter().chain([own]).collect(), inputs, device)?)
+            Comparison::Recommend { .. } => {
+                if inputs.extra.is_some() && baseline.is_none() {
+                    baseline = Some(self.baseline(alone, &key, inputs, device)?);
+                }
+                Some(self.recommend(baseline.into_iter().chain(candidates).collect(), inputs, device)?)
             }
         };
-        let trained = Trained { policies, seeds: seeds.to_vec(), learned, verdict };
+        let learned = learned.unwrap_or_default();
+        let trained = Trained { policies, seeds: seeds.to_vec(), learned, other_policies, verdict };
         let inside = |path: &Path| path.strip_prefix(out).unwrap_or(path).to_owned();
         write_json(&out.join("summary.json"), &trained.clone().with_paths(inside))?;
         Ok(trained)
+    }
+
+    /// What is learned from all rows: the training of the settings, and, where both are asked for, the one with the other actions.
+    fn methods(&self, inputs: &Inputs, device: &Device) -> Vec<Method> {
+        let rows = LearnedRows::with(inputs.extra.as_ref());
+        let learner = self.config.learner.algorithm.about().name;
+        let method = |config: &Config, directory: PathBuf| {
+            let by_clones = config.mixture.by_clones_on(rows);
+            let name = match (rows, by_clones) {
+                (LearnedRows::Target, _) => learner.to_owned(),
+                (LearnedRows::Mixed, false) => format!("{learner} with the extra rows"),
+                (LearnedRows::Mixed, true) => format!("{learner} with the extra rows, clones' actions"),
+            };
+            let spec = TrainingRun { config, ..self.clone() }.spec(inputs, device);
+            let key = key_of(&spec);
+            let step = if directory == self.out { learner.to_owned() } else { name.clone() };
+            Method { name, step, by_clones, key, directory }
+        };
+        let mut methods = vec![method(self.config, self.out.to_owned())];
+        if self.comparison.both() {
+            let other = self.other();
+            methods.push(method(&other, self.out.join(other_folder(&other))));
+        }
+        methods
+    }
+
+    /// The settings with the other actions of the extra rows.
+    fn other(&self) -> Config {
+        let mixture = &self.config.mixture;
+        Config { mixture: mixture.with_actions(mixture.actions.other()), ..self.config.clone() }
     }
 
     /// What every seed learns from.
@@ -284,11 +340,6 @@ impl TrainingRun<'_> {
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
 
-    /// Whether the baseline is trained first, because the extra rows get its actions.
-    fn clones_first(&self, inputs: &Inputs) -> bool {
-        self.config.mixture.by_clones_on(LearnedRows::with(inputs.extra.as_ref()))
-    }
-
     fn recommend(&self, candidates: Vec<Candidate>, inputs: &Inputs, device: &Device) -> Result<Kept> {
         // Without a simulator a single policy is tried, too: there is no other estimate of its return.
         let alone = self.own.env.and_then(|_| only(&candidates));
@@ -303,7 +354,7 @@ impl TrainingRun<'_> {
         keep(verdict, self.out)
     }
 
-    /// All inputs that decide the result. The source's rows decide the comparison alone.
+    /// All inputs that decide the result. The source's rows, and whether both actions are tried, decide the comparison alone.
     fn spec(&self, inputs: &Inputs, device: &Device) -> serde_json::Value {
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": self.config, "seeds": self.seeds, "own": self.own,
@@ -311,6 +362,9 @@ impl TrainingRun<'_> {
         });
         if let Some(source) = &inputs.source {
             spec["source"] = source.hash.clone().into();
+        }
+        if self.comparison.both() {
+            spec["both"] = true.into();
         }
         DeviceKind::from(device).sign(&mut spec);
         spec
@@ -321,18 +375,20 @@ impl TrainingRun<'_> {
         let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
         let learned = LearnedRows::with(inputs.extra.as_ref());
-        let baseline = |course: &mut Course| course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
-        let first = self.clones_first(inputs);
-        if first {
-            baseline(&mut course);
+        let methods = self.methods(inputs, device);
+        for method in &methods {
+            if method.by_clones {
+                course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
+            }
+            course.training(&method.step, config, learned);
         }
-        course.training(config.learner.algorithm.about().name, config, learned);
-        if self.comparison == Comparison::Recommend {
-            if learned == LearnedRows::Mixed && !first {
-                baseline(&mut course);
+        if self.comparison != Comparison::Skip {
+            let mixed = learned == LearnedRows::Mixed;
+            if mixed {
+                course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
             }
             if only_reward(inputs.target.complete()).is_none() {
-                let policies = seeds * if learned == LearnedRows::Mixed { 2 } else { 1 };
+                let policies = seeds * (methods.len() + usize::from(mixed));
                 course.verdict(config, policies);
                 course.fitted_q(config, policies);
             }
@@ -349,15 +405,14 @@ impl TrainingRun<'_> {
         let summary = read_if_there(&out.join("summary.json"))?;
         let trained = summary.as_deref().and_then(|bytes| serde_json::from_slice::<Trained>(bytes).ok());
         let compared = trained.as_ref().is_some_and(|t| t.verdict.is_some());
-        let same = match read_if_there(&out.join(SPEC))? {
-            Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| {
+        let found = read_if_there(&out.join(SPEC))?;
+        let found = found.map(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap_or_default());
+        let same = match &found {
+            Some(found) => {
                 // The source decides the comparison alone: policies that were not compared may be compared with any.
-                if compared && self.comparison == Comparison::Recommend {
-                    found == *spec
-                } else {
-                    without_source(&found) == without_source(spec)
-                }
-            }),
+                let compares = compared && self.comparison != Comparison::Skip;
+                of_policies(found) == of_policies(spec) && (!compares || found["source"] == spec["source"])
+            }
             None => summary.is_none(),
         };
         if !same {
@@ -371,14 +426,16 @@ impl TrainingRun<'_> {
         let Some(mut trained) = trained.map(|t| t.with_paths(|path| out.join(path))) else { return Ok(None) };
         // What is missing or was changed is made again, from what is still there.
         let learned = Done::is_intact(out, key, self.seeds)?;
+        let as_many = found.is_some_and(|found| found["both"] == spec["both"]);
         let kept = match &trained.verdict {
             Some(kept) if learned => self.is_intact(kept, spec, key)?,
             _ => false,
         };
+        let kept = kept && as_many;
         if !kept {
             trained.verdict = None;
         }
-        if !learned || compared && !kept {
+        if !learned || compared && as_many && !kept {
             tce_base::note!("{}: files of the finished training are missing or were changed", out.display());
         }
         Ok(Some(trained).filter(|_| learned && (kept || self.comparison == Comparison::Skip)))
@@ -391,6 +448,14 @@ impl TrainingRun<'_> {
         if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), key, self.seeds)? {
             return Ok(false);
         }
+        if self.comparison.both() {
+            let other = self.other();
+            let mut spec = spec.clone();
+            spec["config"] = serde_json::json!(other);
+            if !Done::is_intact(&self.out.join(other_folder(&other)), &key_of(&spec), self.seeds)? {
+                return Ok(false);
+            }
+        }
         let copied = match (read_if_there(&kept.file)?, read_if_there(&kept.verdict.policy)?) {
             (Some(copy), Some(policy)) => copy == policy,
             _ => false,
@@ -399,75 +464,25 @@ impl TrainingRun<'_> {
     }
 }
 
-/// The reward of all rows of `target`, where they have the same one and it tells nothing of a policy. One other than 0 counts the steps, which
-/// tells something where episodes end in terminals.
-fn only_reward(target: &Transitions) -> Option<f32> {
-    let first = *target.rewards.first()?;
-    let equal = target.rewards.iter().all(|&reward| reward == first);
-    (equal && (first == 0.0 || !target.terminals.contains(&true))).then_some(first)
-}
-
-/// The verdict where the rewards of `target` tell nothing: the baseline. A model of such rewards predicts noise around the one that there is,
-/// and that must not choose. None where they tell something.
-fn without_rewards(candidates: &[Candidate], target: &Transitions) -> Option<Verdict> {
-    let reward = only_reward(target)?;
-    if let Some(verdict) = only(candidates) {
-        let reason =
-            format!("{} The target's rewards are all equal ({reward}) and tell nothing of its return.", verdict.reason);
-        return Some(Verdict { reason, ..verdict });
+/// The folder of policies that learned from the extra rows with the actions of `config`, beside those of the settings.
+fn other_folder(config: &Config) -> &'static str {
+    match config.mixture.actions {
+        RowActions::Own => "own-actions",
+        RowActions::Clones => "clones-actions",
     }
-    let standard = candidates.iter().find(|c| c.baseline)?;
-    Some(Verdict {
-        method: standard.name.clone(),
-        policy: standard.files.first()?.clone(),
-        sure: false,
-        reason: format!(
-            "{} is recommended: the target's rewards are all equal ({reward}), so that nothing can be compared. Record rewards that \
-             tell good steps from bad ones to compare policies.",
-            standard.name
-        ),
-        tried: Vec::new(),
-        behaviour_value: None,
-    })
 }
 
 /// The inputs that decide the policies.
-fn without_source(spec: &serde_json::Value) -> serde_json::Value {
+fn of_policies(spec: &serde_json::Value) -> serde_json::Value {
     let mut spec = spec.clone();
-    spec.as_object_mut().map(|inputs| inputs.remove("source"));
+    if let Some(inputs) = spec.as_object_mut() {
+        inputs.remove("source");
+        inputs.remove("both");
+    }
     spec
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn equal_rewards_tell_nothing_unless_episodes_end() {
-        let told = |rewards: [f32; 3], terminal: bool| {
-            let mut t = Transitions::new(1, 1);
-            for (i, reward) in rewards.into_iter().enumerate() {
-                t.push(&[i as f32], &[0.0], reward, &[i as f32 + 1.0], terminal && i == 2, !terminal && i == 2);
-            }
-            only_reward(&t)
-        };
-        assert_eq!(told([1.0, 1.0, 2.0], false), None);
-        // A reward for every step until the robot falls counts the steps.
-        assert_eq!((told([1.0; 3], true), told([1.0; 3], false)), (None, Some(1.0)));
-        assert_eq!((told([0.0; 3], true), told([0.0; 3], false)), (Some(0.0), Some(0.0)));
-
-        let candidate = |name: &str, baseline, seeds: u64| Candidate {
-            name: name.into(),
-            baseline,
-            files: (0..seeds).map(|seed| policy_file(seed).into()).collect(),
-        };
-        let mut t = Transitions::new(1, 1);
-        t.push(&[0.0], &[0.0], 0.0, &[1.0], true, false);
-        let two = without_rewards(&[candidate("clones", true, 2), candidate("wider", false, 2)], &t).unwrap();
-        assert_eq!((two.method.as_str(), two.sure, two.policy), ("clones", false, PathBuf::from(policy_file(0))));
-        let one = without_rewards(&[candidate("clones", true, 1)], &t).unwrap();
-        assert!(one.sure && one.reason.contains("rewards are all equal (0)"), "{}", one.reason);
-        t.rewards[0] = 1.0;
-        assert_eq!(without_rewards(&[candidate("clones", true, 1)], &t), None);
-    }
+/// The key of the policies that `spec` decides.
+fn key_of(spec: &serde_json::Value) -> String {
+    sha256_hex(of_policies(spec).to_string().as_bytes())
 }

@@ -35,6 +35,8 @@ pub enum Variant {
     TceNoReg,
     /// TCE(OG), cloned with the actions of clones of the target rows.
     TceClones,
+    /// Clones of target and source rows, which have the actions of clones of the target rows.
+    SourceClones,
     /// A method of the registry on target and source rows, in one of its forms.
     Prior(Algorithm, Mode),
     /// IQL on target rows and rows of a model of whole target transitions (SynthER).
@@ -61,7 +63,19 @@ static ALL: LazyLock<Vec<Variant>> = LazyLock::new(|| NAMED.iter().map(|n| n.var
 /// All variants with their names: TCE and its ablations, prior methods, baselines.
 static NAMED: LazyLock<Vec<Named>> = LazyLock::new(|| {
     use Variant::*;
-    let tce = [TceOg, TceNn, TceOt, SimpleAug, TargetOnly, TargetSource, IqlSwt, TceNoFilter, TceNoReg, TceClones];
+    let tce = [
+        TceOg,
+        TceNn,
+        TceOt,
+        SimpleAug,
+        TargetOnly,
+        TargetSource,
+        IqlSwt,
+        TceNoFilter,
+        TceNoReg,
+        TceClones,
+        SourceClones,
+    ];
     // BC and IQL are the learners of other variants.
     let prior = Algorithm::ALL.iter().filter(|a| !matches!(a, Algorithm::Bc | Algorithm::Iql));
     let forms = prior.flat_map(|&algorithm| {
@@ -134,6 +148,11 @@ impl Variant {
                 "TCE(OG), clones' actions",
                 "Clones of target and generated rows, which have the actions of clones of the target rows",
             ),
+            Variant::SourceClones => (
+                "source-clones",
+                "Source states, clones' actions",
+                "Clones of target and source rows, which have the actions of clones of the target rows",
+            ),
             Variant::Prior(algorithm, _) => {
                 let about = algorithm.about();
                 (about.name, about.title, about.description)
@@ -162,9 +181,9 @@ impl Variant {
 
     /// What the variant changes, as TOML; `lambda` is the λ of variants that mix source rows in.
     pub(crate) fn layer(self, lambda: f64, shift: Option<Shift>) -> String {
-        // What is not the program's own imitates all trajectories, as published. The ensemble of clones is what TCE has to beat: it imitates
-        // what TCE imitates.
-        let own = |generated: &str| generated == "tce" || self == Variant::BcEnsemble;
+        // What is not the program's own imitates all trajectories, as published. The ensemble of clones is what TCE has to beat, and states
+        // of the source are the alternative to generated ones: they imitate what TCE imitates.
+        let own = |generated: &str| generated == "tce" || matches!(self, Variant::BcEnsemble | Variant::SourceClones);
         let rows = |generated: &str, source: &str, lambda: f64| {
             let all = if own(generated) { "" } else { "target.trajectories = \"all\"\n" };
             // Dotted keys, so that a variant can add to the table.
@@ -200,6 +219,7 @@ impl Variant {
             let learner = format!("learner.algorithm = \"bc\"\nlearner.bc.ensemble = {ensemble}\n");
             rows("none", "none", 0.0) + &learner + rest
         };
+        let clones_actions = "mixture.actions = \"clones\"\nlearner.algorithm = \"bc\"\n";
         match self {
             Variant::TceOg => rows("tce", "none", 0.0),
             Variant::TceNn => rows("tce", "nearest", lambda),
@@ -210,9 +230,8 @@ impl Variant {
             Variant::IqlSwt => iql("none", "relabelled", 1.0),
             Variant::TceNoFilter => rows("tce", "none", 0.0) + "filter.enabled = false\n",
             Variant::TceNoReg => iql("tce", "none", 0.0),
-            Variant::TceClones => {
-                rows("tce", "none", 0.0) + "mixture.actions = \"clones\"\nlearner.algorithm = \"bc\"\n"
-            }
+            Variant::TceClones => rows("tce", "none", 0.0) + clones_actions,
+            Variant::SourceClones => rows("none", "all", 1.0) + clones_actions,
             Variant::Prior(algorithm, mode) => prior(algorithm, mode),
             Variant::Synther => iql("synther", "none", 0.0),
             Variant::BcRaw => bc(1, "learner.standardise = false\n"),
@@ -268,6 +287,7 @@ mod tests {
         for (variant, expected) in [
             (Variant::TceOg, Auto),
             (Variant::BcEnsemble, Auto),
+            (Variant::SourceClones, Auto),
             (Variant::Bc, All),
             (Variant::BcTop, All),
             (Variant::Prior(Algorithm::Otdf, Mode::Corrected), All),

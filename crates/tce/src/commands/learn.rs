@@ -12,7 +12,7 @@ use tce_run::inputs::Inputs;
 use tce_run::layers::ConfigArgs;
 use tce_run::own::Own;
 use tce_run::pipeline::seeds;
-use tce_run::training_run::{Comparison, Trained, TrainingRun, ensure_fits, ensure_own_folder};
+use tce_run::training_run::{Comparison, Trained, TrainingRun, TriedActions, ensure_fits, ensure_own_folder};
 
 use crate::estimates::{Estimated, estimates};
 use crate::output::{Output, list as listed, table};
@@ -35,6 +35,9 @@ pub struct Learn {
     /// bc: clone the best trajectories only, this share of them.
     #[arg(long, value_name = "SHARE", help_heading = "What is learned")]
     top: Option<f64>,
+    /// bc with --extra: which actions the extra rows are cloned with (default: both are tried and compared, unless mixture.actions is "clones").
+    #[arg(long, value_enum, value_name = "WHOSE", help_heading = "What is learned")]
+    actions: Option<TriedActions>,
     /// Policies to learn; all of them are one training.
     #[arg(long, default_value_t = 1, help_heading = "What is learned")]
     seeds: usize,
@@ -66,9 +69,11 @@ impl Learn {
             return Ok(());
         };
         self.config = self.config.with_own_tables(self.learner, self.top);
-        let config = self.config.layered(None, None)?.config()?;
+        let mut config = self.config.layered(None, None)?.config()?;
         let seeds = seeds(self.seed, self.seeds)?;
-        ensure_fits(&config, LearnedRows::with(self.extra.as_ref()))?;
+        let rows = LearnedRows::with(self.extra.as_ref());
+        let comparison = Comparison::choose(&mut config, self.actions, rows, !self.no_verdict)?;
+        ensure_fits(&config, rows)?;
         super::refuse::folder(&out)?;
         self.config.config.as_deref().map_or(Ok(()), |config| ensure_config_stays(config, &out))?;
         ensure_own_folder(&out)?;
@@ -76,7 +81,6 @@ impl Learn {
         let source = self.source.as_deref().filter(|_| !self.no_verdict);
         let inputs = Inputs::of_files(source, &target, self.extra.as_deref(), &self.own)?;
         let inputs = inputs.with_target_rows(config.target.rows)?;
-        let comparison = if self.no_verdict { Comparison::Skip } else { Comparison::Recommend };
         let run = TrainingRun { config: &config, seeds: &seeds, own: &self.own, comparison, out: &out };
         output.print(&run.run(&inputs, device)?, render);
         Ok(())

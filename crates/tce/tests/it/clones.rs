@@ -43,6 +43,12 @@ fn a_run_shares_its_clones_with_the_baseline() {
     assert!(policy(&own) != policy(&by_clones) && policy(&clones) != policy(&by_clones));
     assert!(policy(&run("tce-og", &CLONES).1) == policy(&by_clones), "the variant is this setting");
     assert_eq!(fs::metadata(&by_clones).unwrap().modified().unwrap(), before, "it is done once");
+
+    // The source's states get the actions of the same clones, without a generator.
+    let before = folders();
+    let (row, by_source) = run("source-clones", &[]);
+    assert!(row["action_distances"][0].as_f64().unwrap() > 0.01 && folders() == before + 1, "{row}");
+    assert!(policy(&by_source) != policy(&by_clones) && policy(&by_source) != policy(&clones));
 }
 
 /// What the rows of a third file did does not matter then, only where they were.
@@ -86,4 +92,45 @@ fn a_training_on_own_files_takes_no_notice_of_the_rows_actions() {
     assert!(compared == by_clones && told.contains("cloning the target rows: learned before"), "{told}");
     let summary: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("a/summary.json")).unwrap()).unwrap();
     assert_eq!(summary["verdict"]["tried"].as_array().unwrap().len(), 2, "{summary}");
+}
+
+/// Where nothing else is said, the extra rows' own actions and the clones' are tried, and the comparison tells which.
+#[test]
+fn both_actions_are_compared() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let (source, _) = data_pair(dir, Agent::Hopper, Shift::Morph);
+    save_d4rl(&dir.join("rows.hdf5"), &random_rows(Agent::Hopper, Shift::Morph, 300, 5), &BTreeMap::new(), &[])
+        .unwrap();
+    let learn = |out: &str, more: &[&str]| {
+        let args = ["learn", "--target", "target.hdf5", "--extra", "rows.hdf5", "--source", source.to_str().unwrap()];
+        let output = tce(dir, &[&args[..], &["--out", out, "--learner", "bc"], TINY, more].concat());
+        assert!(output.status.success(), "{}", message(&output));
+        let summary: serde_json::Value =
+            serde_json::from_slice(&fs::read(dir.join(out).join("summary.json")).unwrap()).unwrap();
+        let tried = summary["verdict"]["tried"].as_array().cloned().unwrap_or_default();
+        (summary, tried.iter().map(|t| t["name"].as_str().unwrap().to_owned()).collect::<Vec<_>>(), message(&output))
+    };
+    let (baseline, own) = ("cloning the target rows", "bc with the extra rows");
+    let clones = "bc with the extra rows, clones' actions";
+    let (summary, tried, _) = learn("both", &[]);
+    assert_eq!(tried, [baseline, own, clones]);
+    assert_eq!(summary["other_policies"], serde_json::json!(["clones-actions/policy-seed0.safetensors"]));
+
+    // They are the policies of the settings, one by one.
+    assert_eq!(learn("own", &["--actions", "own"]).1, [baseline, own]);
+    assert_eq!(learn("clones", &["--actions", "clones"]).1, [baseline, clones]);
+    let both = dir.join("both");
+    assert!(policy(&both) == policy(&dir.join("own")));
+    assert!(policy(&both.join("clones-actions")) == policy(&dir.join("clones")));
+    assert!(policy(&both.join("baseline")) == policy(&dir.join("own/baseline")));
+
+    // A finished training is taken as it is; one that compared fewer policies is continued, and what is lost is made again.
+    assert!(learn("both", &[]).2.contains("done before"));
+    let (_, tried, told) = learn("own", &[]);
+    assert!(tried.len() == 3 && told.contains("bc: learned before") && !told.contains("done before"), "{told}");
+    fs::remove_file(both.join("clones-actions/policy-seed0.safetensors")).unwrap();
+    let (_, tried, told) = learn("both", &[]);
+    assert!(tried.len() == 3 && told.contains("bc: learned before"), "{told}");
+    assert!(policy(&both.join("clones-actions")) == policy(&dir.join("clones")));
 }

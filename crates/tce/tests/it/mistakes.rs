@@ -42,6 +42,8 @@ learn --target target.hdf5 --out out --learner dara
 learn --target target.hdf5 --source ant.hdf5 --out out
 learn --target target.hdf5 --extra target.hdf5 --out out
 learn --target target.hdf5 --extra source.hdf5 --out out --learner iql --set mixture.actions=clones --set mixture.generated=none
+learn --target target.hdf5 --out out --actions both
+learn --target target.hdf5 --extra source.hdf5 --out out --actions both --no-verdict
 learn --target target.hdf5 --out out --set target.rows=3
 learn --target target.hdf5 --out out --set learner.bc.actor.hidden=[256,0]
 augment --source target.hdf5 --target target.hdf5 --out wider.hdf5

@@ -402,19 +402,20 @@ fn a_finished_training_without_its_files_is_not_done() {
     learn(&[]);
     let out = |file: &str| dir.join("out").join(file);
     let read = || {
-        let files =
-            ["policy.safetensors", "policy-seed0.safetensors", "baseline/policy-seed0.safetensors", "verdict.json"];
-        files.map(|file| std::fs::read(out(file)).unwrap())
+        let policies = ["policy.safetensors", "policy-seed0.safetensors", "baseline/policy-seed0.safetensors"];
+        let further = ["clones-actions/policy-seed0.safetensors", "verdict.json"];
+        [&policies[..], &further].concat().into_iter().map(|file| std::fs::read(out(file)).unwrap()).collect::<Vec<_>>()
     };
     let whole = read();
     let remove = |file: &str| std::fs::remove_file(out(file)).unwrap();
     let cut = |file: &str| std::fs::write(out(file), &std::fs::read(out(file)).unwrap()[..100]).unwrap();
-    let damages: [(&dyn Fn(), usize); 5] = [
-        (&|| remove("policy.safetensors"), 2),
-        (&|| cut("policy.safetensors"), 2),
-        (&|| remove("verdict.json"), 2),
-        (&|| cut("policy-seed0.safetensors"), 1),
-        (&|| std::fs::remove_dir_all(out("baseline")).unwrap(), 1),
+    let damages: [(&dyn Fn(), usize); 6] = [
+        (&|| remove("policy.safetensors"), 3),
+        (&|| cut("policy.safetensors"), 3),
+        (&|| remove("verdict.json"), 3),
+        (&|| cut("policy-seed0.safetensors"), 2),
+        (&|| std::fs::remove_dir_all(out("baseline")).unwrap(), 2),
+        (&|| cut("clones-actions/policy-seed0.safetensors"), 2),
     ];
     for (k, (damage, kept)) in damages.into_iter().enumerate() {
         assert!(learn(&[]).contains("done before"), "before damage {k}");
