@@ -24,8 +24,8 @@ use crate::output::{Output, heading, mark_best, table};
 pub struct Run {
     /// The task: ROBOT-SHIFT/SOURCE/TARGET, as in hopper-morph/medium/expert.
     task: Task,
-    /// The methods, separated by commas.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "tce-og", help_heading = "What is learned")]
+    /// The methods, separated by commas (default: tce-og, and tce-clones if the learner is bc).
+    #[arg(long, value_enum, value_delimiter = ',', help_heading = "What is learned")]
     variant: Vec<Variant>,
     /// How many seeds; all of them are one training.
     #[arg(long, default_value_t = 1, help_heading = "What is learned")]
@@ -73,7 +73,10 @@ struct Row {
 
 impl Run {
     /// Runs the command.
-    pub fn run(self, output: Output, device: &Device) -> Result<()> {
+    pub fn run(mut self, output: Output, device: &Device) -> Result<()> {
+        if self.variant.is_empty() {
+            self.variant = self.own_methods()?;
+        }
         if let (Some(learner), true) = (self.learner, self.variant.iter().all(|v| Variant::BASELINES.contains(v))) {
             return Err(Error::Usage(format!(
                 "--learner {}: found baselines alone ({}), which have learners of their own; name a method, or say --set learner.algorithm",
@@ -90,10 +93,7 @@ impl Run {
         // Every configuration is read before anything is computed.
         let configs = variants
             .iter()
-            .map(|(v, baseline)| {
-                let learner = self.learner.filter(|_| !baseline);
-                self.config.clone().with_learner(learner).layered(Some(self.task), Some(*v))?.config()
-            })
+            .map(|&(variant, baseline)| self.config_of(variant, self.learner.filter(|_| !baseline)))
             .collect::<Result<Vec<_>>>()?;
         let seeds = seeds(self.seed, self.seeds)?;
         super::refuse::folder(&self.data.out)?;
@@ -127,6 +127,20 @@ impl Run {
 }
 
 impl Run {
+    /// The program's own methods, which are meant where none is named.
+    fn own_methods(&self) -> Result<Vec<Variant>> {
+        // The same states with other actions: the comparison tells which are better.
+        Ok(match self.config_of(Variant::TceOg, self.learner)?.learner.algorithm {
+            Algorithm::Bc => vec![Variant::TceOg, Variant::TceClones],
+            _ => vec![Variant::TceOg],
+        })
+    }
+
+    /// The settings of a method.
+    fn config_of(&self, variant: Variant, learner: Option<Algorithm>) -> Result<Config> {
+        self.config.clone().with_learner(learner).layered(Some(self.task), Some(variant))?.config()
+    }
+
     /// Tells the steps that are to come.
     fn plan(&self, variants: &[(Variant, bool)], configs: &[Config], seeds: usize, device: &Device) {
         let mut course = Course::new(self.task.agent, seeds, device, &self.data.out);
@@ -231,4 +245,29 @@ fn render(report: &Report) -> String {
         text += "\n";
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Call {
+        #[command(flatten)]
+        run: Run,
+    }
+
+    #[test]
+    fn learners_that_clone_are_tried_with_both_actions() {
+        let methods = |more: &[&str]| {
+            let call = Call::parse_from([&["tce", "hopper-morph/medium/expert"], more].concat());
+            call.run.own_methods().unwrap()
+        };
+        assert_eq!(methods(&[]), [Variant::TceOg, Variant::TceClones]);
+        assert_eq!(methods(&["--learner", "iql"]), [Variant::TceOg]);
+        assert_eq!(methods(&["--preset", "paper"]), [Variant::TceOg]);
+        assert_eq!(methods(&["--preset", "paper", "--learner", "bc"]), [Variant::TceOg, Variant::TceClones]);
+    }
 }

@@ -339,7 +339,7 @@ fn augment_learn_evaluate_and_collect_work_on_peoples_own_files() {
     assert_eq!(learned["policies"].as_array().unwrap().len(), 2);
     // The recommended policy is one of those that were tried: of the learner's, or of the baseline.
     let verdict = &learned["verdict"];
-    assert_eq!(verdict["tried"].as_array().unwrap().len(), 2, "{verdict}");
+    assert_eq!(verdict["tried"].as_array().unwrap().len(), 3, "{verdict}");
     let recommended = fs::read(dir.path().join("policy/policy.safetensors")).unwrap();
     assert!(recommended == fs::read(dir.path().join(verdict["policy"].as_str().unwrap())).unwrap());
     assert!(verdict["reason"].as_str().unwrap().contains("is recommended"), "{verdict}");
@@ -419,7 +419,8 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
     let (source, target) = data_pair(dir.path(), Agent::Walker2d, Shift::Morph);
     let run = |threads: &str, out: &str| {
         let mut args =
-            vec!["run", "walker2d-morph:medium->expert", "--no-baselines", "--out", out, "--threads", threads];
+            vec!["run", "walker2d-morph:medium->expert", "--variant", "tce-og", "--no-baselines", "--out", out];
+        args.extend(["--threads", threads]);
         args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
         args.extend(TINY);
         args.extend(["--set", "generator.state_steps=\"auto\"", "--set", "generator.transition_steps=\"auto\""]);
@@ -453,7 +454,7 @@ fn trainings_end_by_themselves_and_rows_are_filtered_by_learned_dynamics() {
 fn an_interrupted_run_continues_where_it_was() {
     let dir = tempfile::tempdir().unwrap();
     let (source, target) = data_pair(dir.path(), Agent::Hopper, Shift::Morph);
-    let mut args = vec!["run", "hopper-morph:medium->expert", "--no-baselines", "--out", "out"];
+    let mut args = vec!["run", "hopper-morph:medium->expert", "--variant", "tce-og", "--no-baselines", "--out", "out"];
     args.extend(["--source", source.to_str().unwrap(), "--target", target.to_str().unwrap()]);
     args.extend(TINY);
     let mut endless = args.clone();
