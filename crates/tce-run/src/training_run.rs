@@ -384,7 +384,7 @@ impl TrainingRun<'_> {
         }
         if self.comparison != Comparison::Skip {
             let mixed = learned == LearnedRows::Mixed;
-            if mixed {
+            if mixed && !methods.iter().any(|method| method.by_clones) {
                 course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
             }
             if only_reward(inputs.target.complete()).is_none() {
