@@ -104,7 +104,7 @@ def run(
     task : str
         One of :func:`tasks`, as in ``"hopper-morph/medium/expert"``.
     variants : list of str, optional
-        The methods; ``["tce-og"]`` by default.
+        The methods. By default ``tce-og`` and ``tce-clones``; ``tce-og`` alone without baselines, or if the learner is not ``bc``.
     seeds, seed : int
         How many seeds, and the first one.
     preset, config, device

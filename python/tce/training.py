@@ -139,7 +139,7 @@ def train(
     compare : bool
         Train a baseline beside the policies (clones of the target rows alone), try all of them in learned dynamics, and recommend one.
     preset, config, env, step_limit, action_range, device, progress
-        See :func:`tce.augment`. With ``env`` the policies are tried in the benchmark's simulator as well.
+        See :func:`tce.augment`. With ``env`` those of `policies` are tried in the benchmark's simulator as well.
     out : path-like, optional
         The folder for policies, metrics and checkpoints; the same call again takes the results from there. By default a temporary one,
         which goes with the result.

@@ -59,7 +59,7 @@ def test_policies_are_those_of_the_command_line(source, target, wider, tmp_path)
     tce_command("learn", *files, "--out", "command", "--seeds", "2", *sets(), cwd=tmp_path)
     for name in ("policy-seed0.safetensors", "policy-seed1.safetensors", "policy.safetensors"):
         assert (tmp_path / "python" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
-    names = ["cloning the target rows", "bc with the extra rows", "bc with the extra rows, clones' actions"]
+    names = ["cloning the target rows", "bc with the extra rows", "bc with the extra states and the baseline's actions"]
     assert [tried["name"] for tried in run.verdict["tried"]] == names and run.verdict["method"] in names
     other = [f"clones-actions/policy-seed{seed}.safetensors" for seed in (0, 1)]
     assert run.summary["other_policies"] == [str(tmp_path / "python" / name) for name in other]

@@ -183,14 +183,6 @@ impl RowActions {
     fn is_own(&self) -> bool {
         *self == Self::Own
     }
-
-    /// The others of the two.
-    pub fn other(self) -> Self {
-        match self {
-            Self::Own => Self::Clones,
-            Self::Clones => Self::Own,
-        }
-    }
 }
 
 /// The data the policy is learned from.
@@ -204,7 +196,7 @@ pub struct MixtureConfig {
     /// λ, the share of source rows in the mixture; the rest are generated. Source: Eq. 9, Table C.5.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lambda: f64,
-    /// Which actions generated and source rows are cloned with.
+    /// Which actions generated and source rows are cloned with. `tce learn` tries both unless this is "clones" or `--actions` says one.
     // Runs that were done before there was this key have the rows' own, and keep their keys.
     #[serde(default, skip_serializing_if = "RowActions::is_own")]
     pub actions: RowActions,

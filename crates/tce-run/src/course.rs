@@ -101,15 +101,19 @@ impl<'a> Course<'a> {
         let learner = &config.learner;
         let mut of = learner.used(rows);
         of["steps"] = Value::Null;
-        let trained = self.steps.iter().any(|step| step.name == training_step(name));
         let step = self.step(&training_step(name), json!([of, mixed, config.evaluation.episodes]));
-        step.size = if trained { 0.0 } else { learner.steps(rows) as f64 };
+        step.size = learner.steps(rows) as f64;
         // The other learners train something else before, with bars of its own.
         step.last_bar = (learner.algorithm == Algorithm::Bc).then_some("learn ");
         // The cost depends on the settings, not on the name.
         let name = step.name.clone();
         if let Some(kind) = step.kind.strip_prefix(&name) {
             step.kind = format!("learn{kind}");
+        }
+        if let Some((step, earlier)) = self.steps.split_last_mut()
+            && earlier.iter().any(|e| (&e.name, &e.kind) == (&step.name, &step.kind))
+        {
+            step.size = 0.0;
         }
     }
 

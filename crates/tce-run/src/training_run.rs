@@ -6,7 +6,7 @@
 //! | `policy.safetensors` | the recommended one |
 //! | `verdict.json` | why it is recommended |
 //! | `baseline/` | the clones of the target rows, where the policies learned from more than those |
-//! | `clones-actions/`, `own-actions/` | policies that learned from the same rows with other actions ([`Comparison::Recommend`]) |
+//! | `clones-actions/` | the policies that learned from the same rows with the baseline's actions, where both are compared |
 //! | `metrics.jsonl`, `config.toml`, `spec.json`, `summary.json` | metrics, settings, inputs of the key, results |
 //! | `learned.json` | that a training came to its end, here and in the folders |
 //!
@@ -45,6 +45,8 @@ use unrewarded::{only_reward, without_rewards};
 const BASELINE: &str = "cloning the target rows";
 /// The folder of the baseline.
 const BASELINE_FOLDER: &str = "baseline";
+/// The folder of the policies that learned from the extra rows with the baseline's actions, where both are compared.
+const CLONES_FOLDER: &str = "clones-actions";
 /// The file of the settings.
 const CONFIG: &str = "config.toml";
 /// The file of all inputs that decide the result; the first one of a run.
@@ -75,7 +77,7 @@ pub struct Trained {
     /// Training and evaluation.
     #[serde(flatten)]
     pub learned: Learned,
-    /// The policies that learned from the extra rows with other actions, one per seed; none where none were asked for.
+    /// The policies that learned from the extra rows with the baseline's actions, one per seed; none where they were not asked for.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub other_policies: Vec<PathBuf>,
     /// The recommendation, and the file `policy.safetensors` with the policy.
@@ -177,12 +179,21 @@ struct Method {
     directory: PathBuf,
 }
 
+impl Method {
+    /// Whether its training came to its end, and nothing of it was changed since.
+    fn is_done(&self) -> Result<bool> {
+        Ok(Done::read(&self.directory, &self.key)?.is_some())
+    }
+}
+
 /// One of the trainings of a run.
 struct Training<'a> {
     /// What it is called in messages.
     name: &'a str,
     /// One member per seed.
     data: Vec<MemberData>,
+    /// The policies whose actions the extra rows get, if not their own.
+    clones: Option<&'a [PathBuf]>,
     learner: &'a LearnerConfig,
     /// Where its policies are evaluated, if anywhere.
     arena: Option<Arena>,
@@ -200,37 +211,36 @@ impl TrainingRun<'_> {
         let rows = LearnedRows::with(inputs.extra.as_ref());
         ensure_fits(self.config, rows)?;
         if self.comparison.both() {
-            ensure_fits(&self.other(), rows)?;
+            ensure_fits(&self.by_clones(), rows)?;
         }
         inputs.ensure_episodes(&self.config.learner)?;
         let (out, seeds) = (self.out, self.seeds);
         let spec = self.spec(inputs, device);
+        let methods = self.methods(inputs, device);
         let key = key_of(&spec);
-        if let Some(trained) = self.found(&spec, &key)? {
+        if let Some(trained) = self.found(&spec, &methods)? {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
         }
         let data = self.members(inputs)?;
         write_json(&out.join(SPEC), &spec)?;
         tce_base::write_atomically(&out.join(CONFIG), self.config.to_toml().as_bytes())?;
-        self.plan(inputs, device);
+        self.plan(inputs, &methods, device);
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect::<Vec<_>>();
         let mut baseline = None;
         let mut candidates = Vec::new();
         let mut learned = None;
-        for method in self.methods(inputs, device) {
-            let mut data = data.clone();
-            if method.by_clones {
-                if baseline.is_none() {
-                    baseline = Some(self.baseline(alone.clone(), &key, inputs, device)?);
-                }
-                take_actions(&mut data, baseline.as_ref().map_or(&[], |clones| &clones.files))?;
+        for method in methods {
+            if method.by_clones && baseline.is_none() {
+                baseline = Some(self.baseline(alone.clone(), &key, inputs, device)?);
             }
+            let clones = baseline.as_ref().filter(|_| method.by_clones).map(|clones| &clones.files[..]);
             // The first one's policies are the training's own, and tried in a simulator where there is one.
             let arena = self.own.env.filter(|_| learned.is_none());
             let arena = arena.map(|(agent, shift)| Arena::new(agent, shift, ScoreTable::default()));
             let (name, directory) = (&method.step, &method.directory);
-            let training = Training { name, data, learner: &self.config.learner, arena, directory };
+            let data = data.clone();
+            let training = Training { name, data, clones, learner: &self.config.learner, arena, directory };
             let (files, result) = self.train(training, &method.key, inputs, device)?;
             learned.get_or_insert(result);
             candidates.push(Candidate { name: method.name, baseline: inputs.extra.is_none(), files });
@@ -253,7 +263,7 @@ impl TrainingRun<'_> {
         Ok(trained)
     }
 
-    /// What is learned from all rows: the training of the settings, and, where both are asked for, the one with the other actions.
+    /// What is learned from all rows: the training of the settings, and, where both are compared, the one with the baseline's actions.
     fn methods(&self, inputs: &Inputs, device: &Device) -> Vec<Method> {
         let rows = LearnedRows::with(inputs.extra.as_ref());
         let learner = self.config.learner.algorithm.about().name;
@@ -262,7 +272,7 @@ impl TrainingRun<'_> {
             let name = match (rows, by_clones) {
                 (LearnedRows::Target, _) => learner.to_owned(),
                 (LearnedRows::Mixed, false) => format!("{learner} with the extra rows"),
-                (LearnedRows::Mixed, true) => format!("{learner} with the extra rows, clones' actions"),
+                (LearnedRows::Mixed, true) => format!("{learner} with the extra states and the baseline's actions"),
             };
             let spec = TrainingRun { config, ..self.clone() }.spec(inputs, device);
             let key = key_of(&spec);
@@ -271,16 +281,14 @@ impl TrainingRun<'_> {
         };
         let mut methods = vec![method(self.config, self.out.to_owned())];
         if self.comparison.both() {
-            let other = self.other();
-            methods.push(method(&other, self.out.join(other_folder(&other))));
+            methods.push(method(&self.by_clones(), self.out.join(CLONES_FOLDER)));
         }
         methods
     }
 
-    /// The settings with the other actions of the extra rows.
-    fn other(&self) -> Config {
-        let mixture = &self.config.mixture;
-        Config { mixture: mixture.with_actions(mixture.actions.other()), ..self.config.clone() }
+    /// The settings with the baseline's actions.
+    fn by_clones(&self) -> Config {
+        Config { mixture: self.config.mixture.with_actions(RowActions::Clones), ..self.config.clone() }
     }
 
     /// What every seed learns from.
@@ -312,12 +320,15 @@ impl TrainingRun<'_> {
         inputs: &Inputs,
         device: &Device,
     ) -> Result<(Vec<PathBuf>, Learned)> {
-        let Training { name, data, learner, arena, directory } = training;
+        let Training { name, mut data, clones, learner, arena, directory } = training;
         tce_base::begin_step(&training_step(name));
         let names = self.seeds.iter().map(|&seed| policy_file(seed));
         if let Some(done) = Done::read(directory, key)? {
             tce_base::note!("{name}: learned before, in {}", directory.display());
             return Ok((names.map(|name| directory.join(name)).collect(), done.learned));
+        }
+        if let Some(clones) = clones {
+            take_actions(&mut data, clones)?;
         }
         let mut files = Vec::new();
         let evaluation = &self.config.evaluation;
@@ -335,7 +346,8 @@ impl TrainingRun<'_> {
     fn baseline(&self, data: Vec<MemberData>, key: &str, inputs: &Inputs, device: &Device) -> Result<Candidate> {
         let learner = self.config.learner.of_clones();
         let directory = self.out.join(BASELINE_FOLDER);
-        let training = Training { name: BASELINE, data, learner: &learner, arena: None, directory: &directory };
+        let training =
+            Training { name: BASELINE, data, clones: None, learner: &learner, arena: None, directory: &directory };
         let (files, _) = self.train(training, key, inputs, device)?;
         Ok(Candidate { name: BASELINE.into(), baseline: true, files })
     }
@@ -354,7 +366,7 @@ impl TrainingRun<'_> {
         keep(verdict, self.out)
     }
 
-    /// All inputs that decide the result. The source's rows, and whether both actions are tried, decide the comparison alone.
+    /// All inputs that decide the result. The source's rows decide the comparison alone; which policies are compared is told by the results.
     fn spec(&self, inputs: &Inputs, device: &Device) -> serde_json::Value {
         let mut spec = serde_json::json!({
             "program": env!("CARGO_PKG_VERSION"), "config": self.config, "seeds": self.seeds, "own": self.own,
@@ -363,20 +375,16 @@ impl TrainingRun<'_> {
         if let Some(source) = &inputs.source {
             spec["source"] = source.hash.clone().into();
         }
-        if self.comparison.both() {
-            spec["both"] = true.into();
-        }
         DeviceKind::from(device).sign(&mut spec);
         spec
     }
 
     /// Plans the steps of the command.
-    fn plan(&self, inputs: &Inputs, device: &Device) {
+    fn plan(&self, inputs: &Inputs, methods: &[Method], device: &Device) {
         let (rows, seeds, config) = (&inputs.target.rows, self.seeds.len(), self.config);
         let mut course = Course::new(format!("{}x{}", rows.obs_dim, rows.act_dim), seeds, device, self.out);
         let learned = LearnedRows::with(inputs.extra.as_ref());
-        let methods = self.methods(inputs, device);
-        for method in &methods {
+        for method in methods {
             if method.by_clones {
                 course.training(BASELINE, &config.of_clones(), LearnedRows::Target);
             }
@@ -396,23 +404,24 @@ impl TrainingRun<'_> {
         course.plan();
     }
 
-    /// The finished training of `spec`, whose hash is `key`; None if something of it is missing or was changed.
+    /// The finished training of `spec`, which learns by `methods`; None if something of it is missing or was changed.
     ///
     /// # Errors
     /// If the directory holds results or checkpoints of another training.
-    fn found(&self, spec: &serde_json::Value, key: &str) -> Result<Option<Trained>> {
+    fn found(&self, spec: &serde_json::Value, methods: &[Method]) -> Result<Option<Trained>> {
         let out = self.out;
         let summary = read_if_there(&out.join("summary.json"))?;
         let trained = summary.as_deref().and_then(|bytes| serde_json::from_slice::<Trained>(bytes).ok());
         let compared = trained.as_ref().is_some_and(|t| t.verdict.is_some());
-        let found = read_if_there(&out.join(SPEC))?;
-        let found = found.map(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap_or_default());
-        let same = match &found {
-            Some(found) => {
+        let same = match read_if_there(&out.join(SPEC))? {
+            Some(bytes) => serde_json::from_slice::<serde_json::Value>(&bytes).is_ok_and(|found| {
                 // The source decides the comparison alone: policies that were not compared may be compared with any.
-                let compares = compared && self.comparison != Comparison::Skip;
-                of_policies(found) == of_policies(spec) && (!compares || found["source"] == spec["source"])
-            }
+                if compared && self.comparison != Comparison::Skip {
+                    found == *spec
+                } else {
+                    without_source(&found) == without_source(spec)
+                }
+            }),
             None => summary.is_none(),
         };
         if !same {
@@ -425,13 +434,18 @@ impl TrainingRun<'_> {
         }
         let Some(mut trained) = trained.map(|t| t.with_paths(|path| out.join(path))) else { return Ok(None) };
         // What is missing or was changed is made again, from what is still there.
-        let learned = Done::is_intact(out, key, self.seeds)?;
-        let as_many = found.is_some_and(|found| found["both"] == spec["both"]);
+        let key = key_of(spec);
+        let learned = Done::is_intact(out, &key, self.seeds)?;
+        if self.comparison == Comparison::Skip {
+            trained.other_policies.clear();
+        }
+        // An earlier call may have compared fewer policies, or more.
+        let as_many =
+            self.comparison == Comparison::Skip || trained.other_policies.is_empty() != self.comparison.both();
         let kept = match &trained.verdict {
-            Some(kept) if learned => self.is_intact(kept, spec, key)?,
+            Some(kept) if learned && as_many => self.is_intact(kept, spec, &methods[1..])?,
             _ => false,
         };
-        let kept = kept && as_many;
         if !kept {
             trained.verdict = None;
         }
@@ -441,18 +455,15 @@ impl TrainingRun<'_> {
         Ok(Some(trained).filter(|_| learned && (kept || self.comparison == Comparison::Skip)))
     }
 
-    /// Whether a verdict is there with all that it is about: the baseline, where the training `spec` has one, and the recommended policy,
-    /// which is a copy of one of the policies.
-    fn is_intact(&self, kept: &Kept, spec: &serde_json::Value, key: &str) -> Result<bool> {
+    /// Whether a verdict is there with all that it is about: the `further` policies, the baseline, where the training `spec` has one, and the
+    /// recommended policy, which is a copy of one of the policies.
+    fn is_intact(&self, kept: &Kept, spec: &serde_json::Value, further: &[Method]) -> Result<bool> {
         let baseline = !spec["extra"].is_null();
-        if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), key, self.seeds)? {
+        if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), &key_of(spec), self.seeds)? {
             return Ok(false);
         }
-        if self.comparison.both() {
-            let other = self.other();
-            let mut spec = spec.clone();
-            spec["config"] = serde_json::json!(other);
-            if !Done::is_intact(&self.out.join(other_folder(&other)), &key_of(&spec), self.seeds)? {
+        for method in further {
+            if !method.is_done()? {
                 return Ok(false);
             }
         }
@@ -464,25 +475,14 @@ impl TrainingRun<'_> {
     }
 }
 
-/// The folder of policies that learned from the extra rows with the actions of `config`, beside those of the settings.
-fn other_folder(config: &Config) -> &'static str {
-    match config.mixture.actions {
-        RowActions::Own => "own-actions",
-        RowActions::Clones => "clones-actions",
-    }
-}
-
 /// The inputs that decide the policies.
-fn of_policies(spec: &serde_json::Value) -> serde_json::Value {
+fn without_source(spec: &serde_json::Value) -> serde_json::Value {
     let mut spec = spec.clone();
-    if let Some(inputs) = spec.as_object_mut() {
-        inputs.remove("source");
-        inputs.remove("both");
-    }
+    spec.as_object_mut().map(|inputs| inputs.remove("source"));
     spec
 }
 
 /// The key of the policies that `spec` decides.
 fn key_of(spec: &serde_json::Value) -> String {
-    sha256_hex(of_policies(spec).to_string().as_bytes())
+    sha256_hex(without_source(spec).to_string().as_bytes())
 }

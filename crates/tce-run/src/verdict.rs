@@ -10,7 +10,7 @@
 //! 3. Of several seeds of the recommended method, the one with the highest supported return is taken.
 //!
 //! Learned dynamics have errors, above all away from the data: there they invent returns, and nothing counts. If the difference is smaller
-//! than what they can resolve, the baseline is recommended. Where they lose either policy before half of an episode ([`WHOLE`]), the
+//! than what they can resolve, the baseline is recommended. Where they lose the recommended policy, the next best or the baseline before half of an episode ([`WHOLE`]), the
 //! verdict says so and is not sure, however large the difference is: the rest of the episode may decide otherwise. Of target rows in no
 //! order, the length of an episode has to be known for a verdict to be sure.
 
@@ -179,6 +179,25 @@ pub fn recommend_or_only(
     only(candidates).map_or_else(|| recommend(evaluator, candidates, None), Ok)
 }
 
+/// Why a method is recommended: its return, how far it is ahead of the standard, and whether the data tell it from the next best, if that is not
+/// the standard.
+fn ahead(chosen: (&str, f64), standard: (&str, (f64, f64)), next: Option<(&str, (f64, f64))>) -> String {
+    let (name, (by, error)) = standard;
+    let digits = decimals(error);
+    let first = format!(
+        "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.digits$}, which is {by:.digits$} ± \
+         {error:.digits$} more than {name}.",
+        chosen.0, chosen.1,
+    );
+    let Some((next, (by, error))) = next else { return first };
+    let digits = decimals(error);
+    if by > SURE * error {
+        return format!("{first} The next best, {next}, returns {by:.digits$} ± {error:.digits$} less.");
+    }
+    let (by, how) = if by < 0.0 { (-by, "more") } else { (by, "less") };
+    format!("{first} The data do not tell it from {next}, which returns {by:.digits$} ± {error:.digits$} {how}.")
+}
+
 fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Result<Verdict> {
     let returns: Vec<Vec<f64>> = estimates.iter().map(|j| episodes(j)).collect();
     let mean = |k: usize| mean_std(&returns[k]).0;
@@ -200,14 +219,9 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
     let name = |k: usize| &candidates[k].name;
     let digits = gap.map_or(0, |(_, error)| decimals(error));
     let reason = match (next_best, gap) {
-        (Some(k), Some((by, error))) if chosen != standard => {
-            format!(
-                "{} is recommended: tried in learned dynamics, near the target's states, it returns {:.digits$}, {} {:.digits$} (difference from the next best {by:.digits$} ± {error:.digits$}).",
-                name(chosen),
-                mean(chosen),
-                name(standard),
-                mean(standard),
-            ) + if k == standard { "" } else { " The next best is not a baseline." }
+        (Some(k), Some(gap)) if chosen != standard => {
+            let next = (k != standard).then(|| (&name(k)[..], gap));
+            ahead((name(chosen), mean(chosen)), (name(standard), over[chosen]), next)
         }
         (Some(k), Some((by, error))) => {
             let next = name(k);
@@ -226,7 +240,7 @@ fn decide(candidates: &[Candidate], estimates: &[Vec<OffPolicyEstimate>]) -> Res
         mean_std(&estimates[k].iter().map(metric).collect::<Vec<_>>()).0
     };
     let support = |k: usize| of_seeds(k, &|j| j.support);
-    let known = next_best.map_or(1.0, |k| support(chosen).min(support(k)));
+    let known = next_best.map_or(1.0, |k| support(chosen).min(support(k)).min(support(standard)));
     let reason = match known < WHOLE {
         true => format!("{reason} Learned dynamics tell of the first {:.0} % of an episode only.", 100.0 * known),
         false => reason,
@@ -326,7 +340,7 @@ mod tests {
         let ahead = choose([&[150.0, 250.0, 350.0, 450.0], &[150.0, 250.0, 350.0, 452.0]]);
         assert_eq!((ahead.method.as_str(), ahead.policy.to_str(), ahead.sure), ("method", Some("method-1"), true));
         assert_eq!(ahead.tried[1].over_standard[0], 50.0);
-        assert!(ahead.reason.contains("(difference from the next best 50 ± 0)"), "{}", ahead.reason);
+        assert!(ahead.reason.ends_with("it returns 300, which is 50 ± 0 more than baseline."), "{}", ahead.reason);
         assert_eq!([30.0, 0.7, 0.05, 0.001].map(decimals), [0, 1, 2, 3]);
         // As much on average, from one episode: chance.
         let lucky = choose([&[100.0, 200.0, 300.0, 600.0], &[100.0, 200.0, 300.0, 600.0]]);
@@ -348,6 +362,32 @@ mod tests {
         assert_eq!((verdict.method.as_str(), verdict.sure), ("baseline", false));
         assert_eq!(verdict.tried[1].support, Some(0.2));
         assert!(verdict.reason.ends_with("the first 20 % of an episode only."), "{}", verdict.reason);
+    }
+
+    #[test]
+    fn of_two_methods_the_verdict_says_what_is_not_sure() {
+        let three = candidates(&[("baseline", true), ("own", false), ("clones", false)]);
+        let decide = |own: &[f64], clones: &[f64], support: f64| {
+            let baseline = OffPolicyEstimate { support, ..estimate(&[100.0, 200.0, 300.0, 400.0]) };
+            decide(&three, &[vec![baseline], vec![estimate(own)], vec![estimate(clones)]]).unwrap()
+        };
+        let own = [200.0, 300.0, 400.0, 500.0];
+        // Both are far above the baseline, and one is above the other, or they are level.
+        let clear = decide(&own, &[150.0, 250.0, 350.0, 450.0], 1.0);
+        assert_eq!((clear.method.as_str(), clear.sure), ("own", true));
+        let told = "it returns 350, which is 100 ± 0 more than baseline. The next best, clones, returns 50 ± 0 less.";
+        assert!(clear.reason.ends_with(told), "{}", clear.reason);
+        let level = decide(&own, &[201.0, 305.0, 382.0, 504.0], 1.0);
+        assert_eq!((level.method.as_str(), level.sure), ("own", false));
+        assert!(level.reason.ends_with("tell it from clones, which returns 2 ± 5 less."), "{}", level.reason);
+        // The higher mean comes from one episode, and is no reason.
+        let lucky = decide(&own, &[100.0, 200.0, 300.0, 1200.0], 1.0);
+        assert_eq!((lucky.method.as_str(), lucky.sure), ("own", false));
+        assert!(lucky.reason.contains("tell it from clones, which returns 100 ± 200 more."), "{}", lucky.reason);
+        // The baseline was lost early, so that the rest of its episodes is not known.
+        let short = decide(&own, &[150.0, 250.0, 350.0, 450.0], 0.2);
+        assert_eq!((short.method.as_str(), short.sure), ("own", false));
+        assert!(short.reason.ends_with("the first 20 % of an episode only."), "{}", short.reason);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 pub enum Comparison {
     /// Learn a baseline from the target rows alone, try all policies in learned dynamics, and recommend one.
     Recommend {
-        /// Learn further policies from the extra rows, with the actions that `mixture.actions` does not say.
+        /// `mixture.actions` is "own": learn further policies from the extra rows, with the baseline's actions.
         both: bool,
     },
     /// Only train the policies.
@@ -34,7 +34,7 @@ impl Comparison {
     /// rows are compared with both actions, unless `config` says "clones".
     ///
     /// # Errors
-    /// If `actions` were said for nothing: there are no extra rows, or both are wanted and no comparison.
+    /// If `actions` were said for nothing: there are no extra rows, the learner does not clone, or both are wanted and no comparison.
     pub fn choose(
         config: &mut Config,
         actions: Option<TriedActions>,
@@ -48,6 +48,13 @@ impl Comparison {
                     .into(),
             ));
         }
+        let algorithm = config.learner.algorithm;
+        if actions.is_some() && algorithm != Algorithm::Bc {
+            return Err(Error::Usage(format!(
+                "actions: found the learner {}, expected bc, whose option it is: others learn where the rows' own actions lead to",
+                algorithm.about().name
+            )));
+        }
         let both = match actions {
             Some(TriedActions::Both) if !compare => {
                 return Err(Error::Usage(
@@ -57,9 +64,6 @@ impl Comparison {
                 ));
             }
             Some(TriedActions::Both) => {
-                // Refused by the settings' own rule for learners that cannot.
-                let clones = Config { mixture: config.mixture.with_actions(RowActions::Clones), ..config.clone() };
-                clones.ensure_actions(rows)?;
                 config.mixture.actions = RowActions::Own;
                 true
             }
@@ -72,8 +76,7 @@ impl Comparison {
                 false
             }
             None => {
-                let clones_of_both = config.learner.algorithm == Algorithm::Bc && rows == LearnedRows::Mixed;
-                clones_of_both && config.mixture.actions == RowActions::Own
+                algorithm == Algorithm::Bc && rows == LearnedRows::Mixed && config.mixture.actions == RowActions::Own
             }
         };
         Ok(if compare { Self::Recommend { both } } else { Self::Skip })
@@ -105,7 +108,7 @@ mod tests {
         let (own, clones, bc) = (RowActions::Own, RowActions::Clones, Algorithm::Bc);
         assert_eq!(choose(bc, own, None, Mixed, true), Ok((both, own)));
         assert_eq!(choose(bc, clones, Some(Both), Mixed, true), Ok((both, own)));
-        // Settings and options that say one say one.
+        // Options say it, and settings do where they say "clones"; "own" is what they say without being asked.
         assert_eq!(choose(bc, clones, None, Mixed, true), Ok((recommend, clones)));
         assert_eq!(choose(bc, own, Some(Clones), Mixed, true), Ok((recommend, clones)));
         assert_eq!(choose(bc, clones, Some(Own), Mixed, true), Ok((recommend, own)));

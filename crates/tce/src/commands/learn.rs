@@ -47,7 +47,7 @@ pub struct Learn {
     /// The source's rows, to try the policies in learned dynamics of both robots. Without them the target's rows alone are known.
     #[arg(long, value_name = "FILE", help_heading = "Verdict")]
     source: Option<PathBuf>,
-    /// Do not learn a baseline from the target rows alone, do not try the policies, and recommend none.
+    /// Do not learn a baseline from the target rows alone (unless the extra rows get its actions), do not try the policies, and recommend none.
     #[arg(long, help_heading = "Verdict")]
     no_verdict: bool,
     /// Directory for policies and metrics.

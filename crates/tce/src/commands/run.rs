@@ -24,7 +24,7 @@ use crate::output::{Output, heading, mark_best, table};
 pub struct Run {
     /// The task: ROBOT-SHIFT/SOURCE/TARGET, as in hopper-morph/medium/expert.
     task: Task,
-    /// The methods, separated by commas (default: tce-og, and tce-clones if the learner is bc).
+    /// The methods, separated by commas (default: tce-og, and tce-clones if the learner is bc and there are baselines).
     #[arg(long, value_enum, value_delimiter = ',', help_heading = "What is learned")]
     variant: Vec<Variant>,
     /// How many seeds; all of them are one training.
@@ -129,10 +129,18 @@ impl Run {
 impl Run {
     /// The program's own methods, which are meant where none is named.
     fn own_methods(&self) -> Result<Vec<Variant>> {
-        // The same states with other actions: the comparison tells which are better.
-        Ok(match self.config_of(Variant::TceOg, self.learner)?.learner.algorithm {
-            Algorithm::Bc => vec![Variant::TceOg, Variant::TceClones],
-            _ => vec![Variant::TceOg],
+        let own = self.config_of(Variant::TceOg, self.learner)?;
+        if own.learner.algorithm != Algorithm::Bc || self.no_baselines {
+            return Ok(vec![Variant::TceOg]);
+        }
+        // The same states with other actions: the comparison tells which are better. Settings may say one, and then there is one method.
+        let clones = self.config_of(Variant::TceClones, self.learner)?;
+        Ok(if own.mixture.used() != clones.mixture.used() {
+            vec![Variant::TceOg, Variant::TceClones]
+        } else if own.mixture.by_clones() {
+            vec![Variant::TceClones]
+        } else {
+            vec![Variant::TceOg]
         })
     }
 
@@ -269,5 +277,11 @@ mod tests {
         assert_eq!(methods(&["--learner", "iql"]), [Variant::TceOg]);
         assert_eq!(methods(&["--preset", "paper"]), [Variant::TceOg]);
         assert_eq!(methods(&["--preset", "paper", "--learner", "bc"]), [Variant::TceOg, Variant::TceClones]);
+        // The clones are a baseline: who wants none gets none.
+        assert_eq!(methods(&["--no-baselines"]), [Variant::TceOg]);
+        // Settings win over a variant's own.
+        assert_eq!(methods(&["--set", "mixture.actions=clones"]), [Variant::TceClones]);
+        assert_eq!(methods(&["--set", "mixture.actions=own"]), [Variant::TceOg]);
+        assert_eq!(methods(&["--set", "mixture.generated=none"]), [Variant::TceOg]);
     }
 }

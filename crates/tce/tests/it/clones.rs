@@ -102,17 +102,21 @@ fn both_actions_are_compared() {
     let (source, _) = data_pair(dir, Agent::Hopper, Shift::Morph);
     save_d4rl(&dir.join("rows.hdf5"), &random_rows(Agent::Hopper, Shift::Morph, 300, 5), &BTreeMap::new(), &[])
         .unwrap();
-    let learn = |out: &str, more: &[&str]| {
-        let args = ["learn", "--target", "target.hdf5", "--extra", "rows.hdf5", "--source", source.to_str().unwrap()];
-        let output = tce(dir, &[&args[..], &["--out", out, "--learner", "bc"], TINY, more].concat());
+    let few = ["--set=learner.steps=10", "--set=learner.bc.ensemble=2", "--set=fitted_q.steps=0"];
+    let files = ["--target", "target.hdf5", "--extra", "rows.hdf5", "--source", source.to_str().unwrap()];
+    let call = |out: &'static str, more: &[&'static str]| {
+        [&["learn", "--learner", "bc", "--out", out], &files[..], TINY, &few, more].concat()
+    };
+    let file = |out: &str, name: &str| fs::read(dir.join(out).join(name)).unwrap();
+    let learn = |out: &'static str, more: &[&'static str]| {
+        let output = tce(dir, &call(out, more));
         assert!(output.status.success(), "{}", message(&output));
-        let summary: serde_json::Value =
-            serde_json::from_slice(&fs::read(dir.join(out).join("summary.json")).unwrap()).unwrap();
+        let summary: serde_json::Value = serde_json::from_slice(&file(out, "summary.json")).unwrap();
         let tried = summary["verdict"]["tried"].as_array().cloned().unwrap_or_default();
         (summary, tried.iter().map(|t| t["name"].as_str().unwrap().to_owned()).collect::<Vec<_>>(), message(&output))
     };
     let (baseline, own) = ("cloning the target rows", "bc with the extra rows");
-    let clones = "bc with the extra rows, clones' actions";
+    let clones = "bc with the extra states and the baseline's actions";
     let (summary, tried, _) = learn("both", &[]);
     assert_eq!(tried, [baseline, own, clones]);
     assert_eq!(summary["other_policies"], serde_json::json!(["clones-actions/policy-seed0.safetensors"]));
@@ -125,11 +129,24 @@ fn both_actions_are_compared() {
     assert!(policy(&both.join("clones-actions")) == policy(&dir.join("clones")));
     assert!(policy(&both.join("baseline")) == policy(&dir.join("own/baseline")));
 
-    // A finished training is taken as it is; one that compared fewer policies is continued, and what is lost is made again.
+    // A finished training is taken as it is. One that compared fewer policies goes on, also where that was interrupted after its policies were
+    // learned, with the results of the earlier call still there; and the other way round.
     assert!(learn("both", &[]).2.contains("done before"));
+    let results = ["summary.json", "verdict.json"];
+    let two = results.map(|name| file("own", name));
     let (_, tried, told) = learn("own", &[]);
     assert!(tried.len() == 3 && told.contains("bc: learned before") && !told.contains("done before"), "{told}");
+    let three = results.map(|name| file("own", name));
+    for (earlier, more, expected) in [(&two, &[][..], 3), (&three, &["--actions", "own"], 2)] {
+        results.iter().zip(earlier).for_each(|(name, bytes)| fs::write(dir.join("own").join(name), bytes).unwrap());
+        let (_, tried, told) = learn("own", more);
+        assert!(tried.len() == expected && !told.contains("done before"), "{told}");
+    }
+
+    // What is lost is made again, and whoever asks for the training alone gets it, and nothing of the rest.
     fs::remove_file(both.join("clones-actions/policy-seed0.safetensors")).unwrap();
+    let alone = tce_json(dir, &call("both", &["--no-verdict"]));
+    assert!(alone["other_policies"].is_null() && alone["policies"].as_array().unwrap().len() == 1, "{alone}");
     let (_, tried, told) = learn("both", &[]);
     assert!(tried.len() == 3 && told.contains("bc: learned before"), "{told}");
     assert!(policy(&both.join("clones-actions")) == policy(&dir.join("clones")));

@@ -23,14 +23,20 @@ pub(super) struct TierCost {
 }
 
 /// Seconds that `entry` takes.
-fn piece(rates: &mut Rates, entry: &Entry, config: &Config) -> Result<f64> {
+fn piece(rates: &mut Rates, manifest: &Manifest, entry: &Entry, config: &Config) -> Result<f64> {
     let environment = format!("env-{}", entry.task.agent);
     match entry.kind {
         Kind::Source => rates.seconds(&environment, config.source.rows as f64),
         Kind::Target => rates.seconds(&environment, tce_zoo::recipes::TARGET_ROWS as f64),
         Kind::Distances => rates.distances(config),
         Kind::Augment => rates.augmentation(config),
-        Kind::Run => Ok(rates.training(config)? + rates.evaluation(&environment, config)?),
+        Kind::Run => {
+            // Clones whose actions other rows get are a run of their own where the plan has the baseline, and part of this one elsewhere.
+            let planned = entry.needs.iter().any(|&index| manifest.entries[index].kind == Kind::Run);
+            let clones =
+                if config.mixture.by_clones() && !planned { rates.training(&config.of_clones())? } else { 0.0 };
+            Ok(clones + rates.training(config)? + rates.evaluation(&environment, config)?)
+        }
         Kind::Verdict => rates.dynamics(config),
     }
 }
@@ -49,7 +55,7 @@ pub(super) fn costs(manifest: &Manifest) -> Result<Vec<TierCost>> {
         if !configs.contains_key(entry.config.as_str()) {
             configs.insert(&entry.config, manifest.config(entry)?);
         }
-        let seconds = piece(&mut rates, entry, &configs[entry.config.as_str()])?;
+        let seconds = piece(&mut rates, manifest, entry, &configs[entry.config.as_str()])?;
         for tier in tiers.iter_mut().filter(|t| t.tier == entry.tier) {
             tier.pieces += 1;
             tier.core_hours += seconds / 3600.0;
