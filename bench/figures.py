@@ -21,9 +21,13 @@ PAPER = HERE.parent / "crates/tce-report/paper"
 AGENTS = {"halfcheetah": "HalfCheetah", "hopper": "Hopper", "walker2d": "Walker2d", "ant": "Ant"}
 SHIFTS = ["morph", "kinematic", "gravity"]
 BLUE, ORANGE, GREEN, GREY, PALE = "#3d6b94", "#d9772b", "#4d8f5b", "#8a919c", "#dfe2e7"
-OURS = [("bc-ensemble", "five clones of the target rows, ours", BLUE), ("tce-og", "TCE(OG), ours", ORANGE)]
+OURS = [
+    ("bc-ensemble", "five clones of the target rows, ours", BLUE),
+    ("tce-og", "TCE(OG), ours", ORANGE),
+    ("tce-clones", "its states with the clones' actions, ours", GREEN),
+]
 # How a method is called in records from before it was the default.
-SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied, …)": "tce-og"}
+SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied, …)": "tce-og", "tce-og clones": "tce-clones"}
 THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", PALE)]
 
 
@@ -122,9 +126,9 @@ def results():
         for k, (key, label, colour) in enumerate(series):
             for place, agent in enumerate(AGENTS):
                 values = ours.get((f"{agent}-{shift}:medium->expert", key), []) if series[k] in OURS else [paper(shift, agent)[key]]
-                x = place + (k - (len(series) - 1) / 2) * 0.22
+                x = place + (k - (len(series) - 1) / 2) * 0.18
                 mean = sum(values) / len(values) if values else 0
-                axis.bar(x, mean, 0.19, color=colour, label=label if place == 0 else None)
+                axis.bar(x, mean, 0.155, color=colour, label=label if place == 0 else None)
                 if len(values) > 1:
                     axis.plot([x] * len(values), values, "k_", markersize=5)
                 axis.text(x, max([mean, *values]) + 2, f"{mean:.0f}" if values else "–", ha="center", fontsize=8)

@@ -239,4 +239,4 @@ def test_results_show_themselves(source, target, wider):
     assert run.plot().lines
     assert html.escape(run.verdict["reason"]) in run._repr_html_() and "imagined return" in run._repr_html_()
     pytest.importorskip("pandas")
-    assert list(run.to_frame()["baseline"]) == [True, False]
+    assert list(run.to_frame()["baseline"]) == [True, False, False]
