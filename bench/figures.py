@@ -27,7 +27,7 @@ OURS = [
     ("tce-clones", "its states with the clones' actions, ours", GREEN),
 ]
 # How a method is called in records from before it was the default.
-SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied, …)": "tce-og", "tce-og clones": "tce-clones"}
+SAME = {"tce-og (fade)": "tce-og", "tce-og (30 November, varied, …)": "tce-og", "tce-og clones": "tce-clones", "tce-og (s22)": "tce-og", "tce-og (s23, s24, …)": "tce-og"}
 THEIRS = [("TCE(OG)", "TCE(OG), the paper's figure", "#b9bfc8"), ("best", "best other method, the paper's figure", PALE)]
 
 
