@@ -85,9 +85,14 @@ impl<'a> Course<'a> {
                 self.step("generated rows", json!([config.single_stage.sampler, config.single_stage.rows]));
             }
         }
+        self.done_before(before);
+    }
+
+    /// Of the steps from `before` on, those that an earlier method of the command has done cost nothing.
+    fn done_before(&mut self, before: usize) {
         let (earlier, own) = self.steps.split_at_mut(before);
         for step in own {
-            if earlier.iter().any(|e| e.kind == step.kind) {
+            if earlier.iter().any(|e| (&e.name, &e.kind) == (&step.name, &step.kind)) {
                 step.size = 0.0;
             }
         }
@@ -110,11 +115,7 @@ impl<'a> Course<'a> {
         if let Some(kind) = step.kind.strip_prefix(&name) {
             step.kind = format!("learn{kind}");
         }
-        if let Some((step, earlier)) = self.steps.split_last_mut()
-            && earlier.iter().any(|e| (&e.name, &e.kind) == (&step.name, &step.kind))
-        {
-            step.size = 0.0;
-        }
+        self.done_before(self.steps.len() - 1);
     }
 
     /// The clones whose actions other rows get, where `config` says so.

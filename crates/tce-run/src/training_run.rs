@@ -217,7 +217,6 @@ impl TrainingRun<'_> {
         let (out, seeds) = (self.out, self.seeds);
         let spec = self.spec(inputs, device);
         let methods = self.methods(inputs, device);
-        let key = key_of(&spec);
         if let Some(trained) = self.found(&spec, &methods)? {
             tce_base::note!("done before, in {}", out.display());
             return Ok(trained);
@@ -227,12 +226,13 @@ impl TrainingRun<'_> {
         tce_base::write_atomically(&out.join(CONFIG), self.config.to_toml().as_bytes())?;
         self.plan(inputs, &methods, device);
         let alone = data.iter().map(|d| MemberData { extra: None, row_scores: None, ..d.clone() }).collect::<Vec<_>>();
+        let key = &methods[0].key;
         let mut baseline = None;
         let mut candidates = Vec::new();
         let mut learned = None;
-        for method in methods {
+        for method in &methods {
             if method.by_clones && baseline.is_none() {
-                baseline = Some(self.baseline(alone.clone(), &key, inputs, device)?);
+                baseline = Some(self.baseline(alone.clone(), key, inputs, device)?);
             }
             let clones = baseline.as_ref().filter(|_| method.by_clones).map(|clones| &clones.files[..]);
             // The first one's policies are the training's own, and tried in a simulator where there is one.
@@ -243,7 +243,7 @@ impl TrainingRun<'_> {
             let training = Training { name, data, clones, learner: &self.config.learner, arena, directory };
             let (files, result) = self.train(training, &method.key, inputs, device)?;
             learned.get_or_insert(result);
-            candidates.push(Candidate { name: method.name, baseline: inputs.extra.is_none(), files });
+            candidates.push(Candidate { name: method.name.clone(), baseline: inputs.extra.is_none(), files });
         }
         let mut files = candidates.iter().map(|candidate| candidate.files.clone());
         let (policies, other_policies) = (files.next().unwrap_or_default(), files.next().unwrap_or_default());
@@ -251,7 +251,7 @@ impl TrainingRun<'_> {
             Comparison::Skip => None,
             Comparison::Recommend { .. } => {
                 if inputs.extra.is_some() && baseline.is_none() {
-                    baseline = Some(self.baseline(alone, &key, inputs, device)?);
+                    baseline = Some(self.baseline(alone, key, inputs, device)?);
                 }
                 Some(self.recommend(baseline.into_iter().chain(candidates).collect(), inputs, device)?)
             }
@@ -263,7 +263,7 @@ impl TrainingRun<'_> {
         Ok(trained)
     }
 
-    /// What is learned from all rows: the training of the settings, and, where both are compared, the one with the baseline's actions.
+    /// What is learned from all rows: first the training of the settings, whose key is the baseline's, too, and, where both are compared, the one with the baseline's actions.
     fn methods(&self, inputs: &Inputs, device: &Device) -> Vec<Method> {
         let rows = LearnedRows::with(inputs.extra.as_ref());
         let learner = self.config.learner.algorithm.about().name;
@@ -434,8 +434,7 @@ impl TrainingRun<'_> {
         }
         let Some(mut trained) = trained.map(|t| t.with_paths(|path| out.join(path))) else { return Ok(None) };
         // What is missing or was changed is made again, from what is still there.
-        let key = key_of(spec);
-        let learned = Done::is_intact(out, &key, self.seeds)?;
+        let learned = Done::is_intact(out, &methods[0].key, self.seeds)?;
         if self.comparison == Comparison::Skip {
             trained.other_policies.clear();
         }
@@ -443,7 +442,7 @@ impl TrainingRun<'_> {
         let as_many =
             self.comparison == Comparison::Skip || trained.other_policies.is_empty() != self.comparison.both();
         let kept = match &trained.verdict {
-            Some(kept) if learned && as_many => self.is_intact(kept, spec, &methods[1..])?,
+            Some(kept) if learned && as_many => self.is_intact(kept, spec, methods)?,
             _ => false,
         };
         if !kept {
@@ -455,14 +454,14 @@ impl TrainingRun<'_> {
         Ok(Some(trained).filter(|_| learned && (kept || self.comparison == Comparison::Skip)))
     }
 
-    /// Whether a verdict is there with all that it is about: the `further` policies, the baseline, where the training `spec` has one, and the
-    /// recommended policy, which is a copy of one of the policies.
-    fn is_intact(&self, kept: &Kept, spec: &serde_json::Value, further: &[Method]) -> Result<bool> {
+    /// Whether a verdict is there with all that it is about: the policies of the further `methods`, the baseline, where the training `spec` has
+    /// one, and the recommended policy, which is a copy of one of the policies.
+    fn is_intact(&self, kept: &Kept, spec: &serde_json::Value, methods: &[Method]) -> Result<bool> {
         let baseline = !spec["extra"].is_null();
-        if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), &key_of(spec), self.seeds)? {
+        if baseline && !Done::is_intact(&self.out.join(BASELINE_FOLDER), &methods[0].key, self.seeds)? {
             return Ok(false);
         }
-        for method in further {
+        for method in &methods[1..] {
             if !method.is_done()? {
                 return Ok(false);
             }
